@@ -2,9 +2,9 @@
 
 A beam, a rope and a sheet, each recorded by the project's engine with a linear drag that their scenes do not declare,
 go through the library (``physworld fit``, ``physworld trace``) and through the service (upload, fit, demonstrations,
-training, published model). What comes out is reduced to SHA-256 digests: of every array, and of every report without
-what differs from run to run (times, ids, dates). The same code on the same machine gives the same digests; another
-processor need not. ``--check`` compares with the digests of an earlier run, names what differs, and ends with 1.
+training, published model, trace). What comes out is reduced to SHA-256 digests: of every array, and of every report
+without what differs from run to run (times, ids, dates). The same code on the same machine gives the same digests;
+another processor need not. ``--check`` compares with those of an earlier run, names what differs, and ends with 1.
 
 Only the command line and the SDK are used, so that this script stays as it is while the rooms behind them move.
 """
@@ -36,6 +36,7 @@ from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.trace import TraceConfig
 
 BODIES = ("beam", "rope", "sheet")
 DRAG_PER_S = 3.0
@@ -78,7 +79,7 @@ def of_library(bundle: Path, particles: int, folder: Path) -> dict[str, str]:
 
 
 def of_service(client: Client, bundle: Path, particles: int, folder: Path) -> dict[str, str]:
-    """Digests of one pipeline's fit, episodes and model."""
+    """Digests of one pipeline's fit, episodes and model, and of a trace."""
     scene = client.scenes.create(bundle)
     body = PipelineCreate(
         scene_id=scene.id,
@@ -103,7 +104,13 @@ def of_service(client: Client, bundle: Path, particles: int, folder: Path) -> di
         f"model {name}": of_array(array) for name, array in load_file(model / "model.safetensors").items()
     }
     found |= {f"model prediction {name}": digest for name, digest in of_arrays(model / "prediction.npz")}
-    return found
+    job = client.jobs.wait(
+        client.traces.create(scene.id, TraceConfig(), fit=FitConfig(particle_budget=particles))
+    )
+    trace = client.traces.get(job.outputs[0].id)
+    found["trace report"] = of_json(trace.model_dump(mode="json"))
+    tracks = client.traces.tracks(trace.id)
+    return found | {f"trace {name}": of_array(tracks[name]) for name in sorted(tracks)}
 
 
 def of_arrays(path: Path) -> Iterator[tuple[str, str]]:

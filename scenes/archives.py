@@ -22,6 +22,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import IO
 
@@ -128,14 +129,8 @@ def read_archive(
     """
     if not is_zip(data) and not is_tar(data):
         raise ArchiveRefused(f"neither a zip nor a tar (it begins with {data[:8].hex(' ') or 'nothing'})")
-    try:
-        if is_zip(data):
-            return _read_zip(data, wanted, limits)
-        return _read_tar(data, wanted, limits)
-    except ArchiveRefused:
-        raise
-    except DAMAGED as error:
-        raise ArchiveRefused(f"the archive of {len(data)} bytes is damaged or truncated: {error}") from error
+    with _damage_told(f"the archive of {len(data)} bytes"):
+        return _read_zip(data, wanted, limits) if is_zip(data) else _read_tar(data, wanted, limits)
 
 
 def read_arrays(
@@ -148,15 +143,22 @@ def read_arrays(
     """
     if not is_zip(data):
         raise ArchiveRefused(f"not an npz (it begins with {data[:8].hex(' ') or 'nothing'})")
-    try:
+    with _damage_told(f"the npz of {len(data)} bytes"):
         files = _read_zip(data, None, limits)
-    except ArchiveRefused:
-        raise
-    except DAMAGED as error:
-        raise ArchiveRefused(f"the npz of {len(data)} bytes is damaged or truncated: {error}") from error
     return {
         name.removesuffix(".npy"): parse_array(name, content, text=text) for name, content in files.items()
     }
+
+
+@contextmanager
+def _damage_told(what: str) -> Iterator[None]:
+    """Turns what the readers of archives raise on damaged ones into the refusal of ``what``."""
+    try:
+        yield
+    except ArchiveRefused:
+        raise
+    except DAMAGED as error:
+        raise ArchiveRefused(f"{what} is damaged or truncated: {error}") from error
 
 
 def _read_zip(data: bytes, wanted: frozenset[str] | None, limits: ArchiveLimits) -> dict[str, bytes]:

@@ -41,7 +41,7 @@ from physworld_scenes.colliders import (
     meshes_of,
 )
 from physworld_scenes.declaration import SCHEMA_VERSION, UNDEFORMED_TEXT, parse_json
-from physworld_scenes.errors import SceneInvalid
+from physworld_scenes.errors import SceneInvalid, refused
 from physworld_scenes.measured import hold
 from physworld_scenes.validation import check_scene
 from physworld_schemas.base import FieldError
@@ -58,6 +58,7 @@ FIELD_OF_ARRAY = {
     "controllers": "controllers",
     "times": "times",
     "controller_velocities": "controller_velocities",
+    "controller_errors": "controller_errors_m",
     "ctrl_times": "control_times",
     "ctrl_points": "control_points",
     "rest_volume_points": "rest_volume_points",
@@ -98,7 +99,7 @@ def read_with_warnings(path: Path | str, limits: ArchiveLimits = DEFAULT_LIMITS)
     for name in (JSON_NAME, ARRAYS_NAME):
         size = (path / name).stat().st_size
         if size > limits.total_bytes:
-            raise _refused(name, f"has {size} bytes, at most {limits.total_bytes} are read")
+            raise refused(name, f"has {size} bytes, at most {limits.total_bytes} are read")
 
     def fetch(name: str) -> bytes | None:
         file = (path / name).resolve()
@@ -122,13 +123,13 @@ def bundle_from_bytes(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> tu
         if arrays_path not in files:
             raise ArchiveRefused(f"holds no {ARRAYS_NAME} beside {JSON_NAME}")
     except ArchiveRefused as error:
-        raise _refused("archive", str(error)) from error
+        raise refused("archive", str(error)) from error
 
     def fetch(name: str) -> bytes | None:
         try:
             named = read_archive(data, frozenset({name.rpartition("/")[2]}), limits)
         except ArchiveRefused as error:
-            raise _refused(name, str(error)) from error
+            raise refused(name, str(error)) from error
         return named.get(f"{folder}/{name}".lstrip("/"))
 
     return scene_from_files(files[f"{folder}/{JSON_NAME}".lstrip("/")], files[arrays_path], limits, fetch)
@@ -395,7 +396,3 @@ def _number(value: Any) -> float | None:
 
 def _list(values: Array | None) -> list[float] | None:
     return None if values is None else _float64(values).tolist()
-
-
-def _refused(where: str, message: str) -> SceneInvalid:
-    return SceneInvalid([FieldError(loc=[where], msg=message)])

@@ -45,6 +45,7 @@ ARRAY_SHAPES = {
     "controllers": ("T", "K", 3),
     "times": ("T",),
     "controller_velocities": ("T", "K", 3),
+    "controller_errors": ("E", "T", "K", 3),
     "ctrl_times": ("C",),
     "ctrl_points": ("C", "K", 3),
     "rest_volume_points": ("M", 3),
@@ -53,7 +54,7 @@ ARRAY_SHAPES = {
 }
 REQUIRED = ("points", "visible", "controllers", "times")
 NEVER_EMPTY = ("rest_volume_points", "ctrl_times", "ctrl_points")
-PLACES = ("points", "controllers", "ctrl_points", "rest_volume_points", "surface_points")
+PLACES = ("points", "controllers", "controller_errors", "ctrl_points", "rest_volume_points", "surface_points")
 
 
 @dataclass
@@ -190,8 +191,7 @@ def check_places(arrays: dict[str, Array], measured: Measured, findings: Finding
 
 def _farthest(places: Array) -> tuple[int, float, tuple[int, ...]]:
     """How many values lie beyond ``FARTHEST_M``, the farthest of all [m], and its indices; some rows at a time."""
-    count, farthest, first = 0, -1.0, 0
-    row = places[:1].size
+    count, farthest, first, row = 0, -1.0, 0, places[:1].size
     rows = max(1, BLOCK_VALUES // max(row, 1))
     for start in range(0, len(places), rows):
         far = np.abs(places[start : start + rows].astype(np.float64))
@@ -235,8 +235,7 @@ def check_units(measured: Measured, findings: Findings) -> None:
     if measured.seen[measured.first_frame].sum() < 2:
         return
     if size > LARGEST_OBJECT_M or size < SMALLEST_OBJECT_M:
-        bound = LARGEST_OBJECT_M if size > LARGEST_OBJECT_M else SMALLEST_OBJECT_M
-        word = "more" if size > bound else "less"
+        word, bound = ("more", LARGEST_OBJECT_M) if size > LARGEST_OBJECT_M else ("less", SMALLEST_OBJECT_M)
         findings.fault(
             where, f"the object measures {size:.4g} m, {word} than {bound:g} m: not metres?{unit_hint(size)}"
         )
@@ -390,11 +389,8 @@ def _measure(arrays: dict[str, Array], findings: Findings) -> Measured:
     controllers = np.asarray(arrays["controllers"], dtype=np.float64)
     known: Array = np.all(np.isfinite(controllers), axis=2)
     controllers = hold(controllers, known)
-    shown = seen.any(axis=1)
-    size = 0.0
-    if shown.any():
-        t = int(np.argmax(shown))
-        size = float(np.linalg.norm(np.ptp(cleaned[t, seen[t]], axis=0)))
+    t = int(np.argmax(seen.any(axis=1)))
+    size = float(np.linalg.norm(np.ptp(cleaned[t, seen[t]], axis=0))) if seen.any() else 0.0
     times = np.asarray(arrays["times"], dtype=np.float64)
     return Measured(cleaned, seen, controllers, times, size)
 

@@ -165,8 +165,7 @@ def check_body(declaration: Declaration, measured: Measured, findings: Findings)
         if not 1.0 / (2.0 * MASS_FACTOR_WARNING) <= factor <= MASS_FACTOR_WARNING:
             findings.warn(
                 [*where, "mass_kg"],
-                f"is {body.mass_kg:g} kg; "
-                f" the declared box full of {body.density_kg_m3:g} kg/m3 weighs {full:.4g} kg",
+                f"is {body.mass_kg:g} kg; the declared box full of {body.density_kg_m3:g} kg/m3 weighs {full:.4g} kg",
             )
     if (body.box_min_m is None) != (body.box_max_m is None):
         findings.fault([*where, "box_min_m"], "box_min_m and box_max_m come together or not at all")
@@ -284,25 +283,21 @@ def _check_box(
 def _check_box_size(body: BodyForm, findings: Findings) -> None:
     if body.size_m is None or body.box_min_m is None or body.box_max_m is None:
         return
-    box = np.subtract(body.box_max_m, body.box_min_m)
+    box, where = np.subtract(body.box_max_m, body.box_min_m), ["scene.json", "body", "size_m"]
     if (box > 0).all() and not np.allclose(box, body.size_m, rtol=0.1):
-        findings.fault(
-            ["scene.json", "body", "size_m"],
-            f"is {list(body.size_m)}, the box measures {box.round(6).tolist()}",
-        )
+        findings.fault(where, f"is {list(body.size_m)}, the box measures {box.round(6).tolist()}")
 
 
 def _check_topology(body: BodyForm, count: int, findings: Findings) -> None:
     where = ["scene.json", "body", "topology"]
-    edges = None if body.topology is None else body.topology.edges
+    edges, n = (None, None) if body.topology is None else (body.topology.edges, body.topology.n)
     if edges is not None:
         outside = [list(pair) for pair in edges if max(pair) >= count]
         if outside:
             findings.fault([*where, "edges"], f"{len(outside)} name points beyond the {count}: {outside[:3]}")
         if any(a == b for a, b in edges):
             findings.fault([*where, "edges"], "one joins a point to itself")
-    if body.topology is not None and body.topology.n is not None and body.topology.n**2 != count:
-        n = body.topology.n
+    if n is not None and n**2 != count:
         findings.fault([*where, "n"], f"is {n}, a grid of {n * n} points; there are {count}")
     lengths = body.segment_rest_lengths_m
     expected = len(edges) if edges is not None else count - 1
@@ -358,18 +353,18 @@ def _check_region(
         return
     body = declaration.body
     margin = REGION_TOLERANCE_SIZES * max(measured.size_m, declared_size_m(body) or 0.0)
-    low, high = np.subtract(grip.region_min_m, margin), np.add(grip.region_max_m, margin)
     volume = arrays.get("rest_volume_points")
     if volume is not None and volume.dtype.kind in "fiu" and volume.shape[1:] == (3,) and len(volume):
         material, what = np.asarray(volume, dtype=np.float64), f"{len(volume)} volume points"
     elif body.box_min_m is not None and body.box_max_m is not None:
-        nearest = np.clip((low + high) / 2.0, body.box_min_m, body.box_max_m)
+        middle = np.add(grip.region_min_m, grip.region_max_m) / 2.0
+        nearest = np.clip(middle, body.box_min_m, body.box_max_m)
         material, what = nearest[None], "declared body's box"
     else:
         first = measured.first_frame
         margin = 0.05 * measured.size_m
-        low, high = np.subtract(grip.region_min_m, margin), np.add(grip.region_max_m, margin)
         material, what = measured.points[first, measured.seen[first]], "visible points of the first frame"
+    low, high = np.subtract(grip.region_min_m, margin), np.add(grip.region_max_m, margin)
     if not ((material >= low) & (material <= high)).all(axis=1).any():
         findings.fault(
             where,
@@ -395,12 +390,10 @@ def _check_radius(
     first, body = measured.first_frame, declaration.body
     points = measured.points[first, measured.seen[first]]
     nearest, what = float(np.linalg.norm(at[:, None] - points, axis=2).min()), "visible point"
+    most, report = radius_m, findings.warn
     if declaration.initial_state.startswith("undeformed") and None not in (body.box_min_m, body.box_max_m):
         inside = np.clip(at, body.box_min_m, body.box_max_m)
         nearest, what = float(np.linalg.norm(at - inside, axis=1).min()), "place in the declared body's box"
-        if nearest > radius_m + REGION_TOLERANCE_SIZES * measured.size_m:
-            findings.fault(
-                where, f"is {radius_m:.4g} m, the nearest {what} is {nearest:.4g} m from a controller"
-            )
-    elif nearest > radius_m:
-        findings.warn(where, f"is {radius_m:.4g} m, the nearest {what} is {nearest:.4g} m from a controller")
+        most, report = radius_m + REGION_TOLERANCE_SIZES * measured.size_m, findings.fault
+    if nearest > most:
+        report(where, f"is {radius_m:.4g} m, the nearest {what} is {nearest:.4g} m from a controller")

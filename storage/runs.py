@@ -131,7 +131,14 @@ def mark_run_ready(
 
 
 def end_run(session: Session, kind: RunKind, run_id: str, state: Unmade) -> None:
-    """Mark a pending run failed or cancelled; a ready one stays as it is."""
+    """Mark a pending run failed or cancelled; a ready one stays as it is.
+
+    Args:
+        session: the transaction that it belongs to.
+        kind: of the run.
+        run_id: the run.
+        state: failed or cancelled.
+    """
     row = run_row(session, kind, run_id)
     if row.state == "pending":
         row.state = state

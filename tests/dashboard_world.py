@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tiny_scene import register
 
 from physworld.demonstrate.coverage import Coverage
 from physworld.scene import Body, Scene
-from physworld_scenes.bundle import canonical_archive
 from physworld_schemas.arrays import EncodedArray
 from physworld_schemas.assessment import AssessmentCreate
 from physworld_schemas.base import Artifact, Problem
@@ -123,26 +123,8 @@ def chain_recording() -> Scene:
 
 def add_scene(world: World, recording: Scene) -> str:
     """Store a recording as the API does; its id."""
-    archive = world.stores.artifacts.put_bytes(canonical_archive(recording), "scene.zip", "application/zip")
-    with world.database.session() as session:
-        scene = resources.create_scene(
-            session,
-            name=recording.name,
-            kind=recording.kind,
-            description=recording.description,
-            digest=archive.sha256,
-            frames=recording.frame_count,
-            points=recording.points.shape[1],
-            controllers=recording.controllers.shape[1],
-            fps=recording.fps,
-            duration_s=float(recording.times[-1]),
-            noise_sigma_m=recording.noise_sigma_m,
-            train=recording.train,
-            test=recording.test,
-            declared={"gravity_m_s2": [0.0, 0.0, -9.81], "body": {"length_m": 0.45, "density_kg_m3": 1100.0}},
-            artifacts=[archive],
-        )
-    return scene.id
+    declared = {"gravity_m_s2": [0.0, 0.0, -9.81], "body": {"length_m": 0.45, "density_kg_m3": 1100.0}}
+    return register(recording, world.database, world.stores.artifacts, declared)
 
 
 def claim(world: World, job_id: str) -> leases.Lease:

@@ -12,18 +12,22 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 from tiny_scene import register, tiny_scene, tiny_thing
 
-from physworld.demonstrate import DemonstrationConfig, derived_seed, make_episode
+from physworld.demonstrate import DemonstrationConfig, StrengthRange, derived_seed, make_episode
+from physworld.effects.registry import effect
 from physworld.scene import Scene
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 from physworld.worldmodel.dataset import read_track
+from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
+from physworld.worldmodel.model.properties import PROPERTIES
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import view_scene
 from physworld.worldmodel.training import train
 from physworld_schemas.base import Lineage
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.model import TrainingConfig as WireConfig
+from physworld_services.trainer.episodes import column_of
 from physworld_storage import registry
 from physworld_storage.artifacts import ArtifactStore
 from physworld_storage.database import Database
@@ -34,19 +38,34 @@ FRAMES, EPISODES = 24, 6
 SMALL = WorldModelConfig(hidden=16, message_passing_steps=2, history=2, vertices=20, neighbours=5, modes=6)
 
 
+DRAG = StrengthRange("air_drag_linear", "rate_per_s", 2.0, 0.5, 3.5)
+"""Strength of an effect that the demonstrations of a dragged thing vary: what its trace said, and the interval."""
+
+
 @cache
-def tiny_model(kind: str = "beam") -> tuple[Scene, Twin, PublishedModel]:
-    """The scene, its twin with prior parameters, and a model that learned from the twin: a bar's, or a thing's."""
+def tiny_model(kind: str = "beam", dragged: bool = False) -> tuple[Scene, Twin, PublishedModel]:
+    """The scene, its twin with prior parameters, and a model that learned from the twin: a bar's, or a thing's.
+
+    ``dragged``: the twin has ``DRAG``, and its demonstrations vary it.
+    """
     scene = tiny_scene(FRAMES) if kind == "beam" else tiny_thing(kind, FRAMES)
     twin = build_twin(scene, 60)
     twin = twin.with_parameters(youngs_modulus_pa=3e4) if kind == "beam" else twin
+    columns, column = PROPERTIES, column_of(DRAG, "1/s")
+    if dragged:
+        twin = twin.with_effect(effect(DRAG.effect, **{DRAG.name: DRAG.value}))
+        columns = (*PROPERTIES, column)
     view = view_scene(scene, twin, SMALL)
-    settings = DemonstrationConfig(frames=FRAMES)
-    episodes = [make_episode(scene, twin, settings, derived_seed(0, index))[0] for index in range(EPISODES)]
-    tracks = [read_track(view.spec, arrays, SMALL.history) for arrays in episodes]
-    trained = train(tracks, view.spec, SMALL, TrainingConfig(steps=12, batch_size=2, look_ahead=2))
-    phi = np.zeros((view.spec.object_count, 2))
-    return scene, twin, view.published(trained.model, phi, phi)
+    settings = DemonstrationConfig(frames=FRAMES, strengths=(DRAG,) if dragged else ())
+    episodes = [make_episode(scene, twin, settings, derived_seed(0, index)) for index in range(EPISODES)]
+    tracks = []
+    for arrays, told in episodes:
+        drawn = {name: column.column_of(value) for name, value in told["effect_strengths"].items()}
+        tracks.append(read_track(view.spec, arrays, SMALL.history, columns, drawn))
+    training = TrainingConfig(steps=12, batch_size=2, look_ahead=2)
+    model = train(tracks, view.spec, SMALL, training, columns=columns).model
+    phi, stands = np.zeros((view.spec.object_count, 2)), {column.name: 0.0} if dragged else {}
+    return scene, twin, view.published(model.at_strengths(stands), phi, phi, Conditioning.of(model, stands))
 
 
 def publish_tiny(
@@ -55,6 +74,8 @@ def publish_tiny(
     *,
     name: str = NAME,
     kind: str = "beam",
+    dragged: bool = False,
+    acting: tuple[str, dict[str, float]] | None = None,
     lacking: str | None = None,
     card: dict[str, Any] | None = None,
     changed: dict[str, Callable[[np.ndarray], np.ndarray]] | None = None,
@@ -62,10 +83,12 @@ def publish_tiny(
 ) -> tuple[str, int]:
     """Register scene, fit and model; the model's name and version.
 
-    ``kind``: of the thing; ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more
-    of its card; ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all.
+    ``kind``: of the thing; ``dragged``: as of ``tiny_model``; ``acting``: an effect of the twin beside the model, with
+    its strengths; ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more of its
+    card; ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all.
     """
-    scene, twin, model = tiny_model(kind)
+    scene, twin, model = tiny_model(kind, dragged)
+    twin = twin if acting is None else twin.with_effect(effect(acting[0], **acting[1]))
     scene_id = register(scene, database, artifacts)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **twin.to_arrays())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -76,14 +77,17 @@ def tiny_thing(kind: str, frames: int = FRAMES) -> Scene:
     )
 
 
-def register(scene: Scene, database: Database, artifacts: ArtifactStore) -> str:
-    """Store the scene as an upload would; its id."""
+def register(
+    scene: Scene, database: Database, artifacts: ArtifactStore, declared: dict[str, Any] | None = None
+) -> str:
+    """Store the scene as an upload would, with what it declares for people; its id."""
     archive = artifacts.put_bytes(canonical_archive(scene), "scene.zip", "application/zip")
     with database.session() as session:
         return resources.create_scene(
             session,
             name=scene.name,
             kind=scene.kind,
+            description=scene.description,
             digest=archive.sha256,
             frames=scene.frame_count,
             points=scene.points.shape[1],
@@ -93,5 +97,6 @@ def register(scene: Scene, database: Database, artifacts: ArtifactStore) -> str:
             noise_sigma_m=scene.noise_sigma_m,
             train=scene.train,
             test=scene.test,
+            declared=declared,
             artifacts=[archive],
         ).id

@@ -1,14 +1,15 @@
 """A new user's times, from an empty folder: to the first held-out table, and to the first plot in a notebook.
 
-``python -m benchmarks.service.new_user [--json FILE]``, from a clone whose `make wheels` works. Both begin with
-nothing: an empty home (no package and no kernel is cached) and no environment of ours.
+``python -m benchmarks.service.new_user [--json FILE]`` measures what is committed. Both begin with an empty home, so
+that no package and no kernel is cached, and with those variables alone that say where things come from (``KEPT``).
 
 1. `git clone`, `make demo` (which installs) until the results table is printed.
-2. An empty environment, `pip install` of the built wheels with what a notebook needs, and the guide's first notebook
-   (docs/notebooks/recording_to_model.ipynb), which starts the service, fits, demonstrates and trains, until its first
-   plot. Building the wheels is not the user's work and is not counted.
+2. An empty environment, `pip install` of the wheels that were built in the clone, with what a notebook needs, and the
+   guide's first notebook (docs/notebooks/recording_to_model.ipynb), which starts the service, fits, demonstrates and
+   trains, until its first plot. Building the wheels is not the user's work and is not counted.
 
-Packages come from the index that pip is set up with; how near that is decides much of both.
+An emptied environment stands in for a bare machine: this system's Python, git and make are used, and its files are
+cached in memory. Packages come from the index that pip is set up with; how near that is decides much of both.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ import os
 import resource
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,19 @@ NOTEBOOK = Path("docs/notebooks/recording_to_model.ipynb")
 TABLE, INSTALLED, PLOT = "Held-out error of", "bootstrap: done", "image/png"
 EXTRAS = {"physworld-": "[api,sim,train]", "physworld_client-": "[plot]"}
 KERNEL = ("ipykernel", "nbclient")
-MINE = ("PHYSWORLD_", "VIRTUAL_ENV", "PYTHONPATH", "XDG_", "WARP_", "MAKE", "MFLAGS", "MPL")
+KEPT = (
+    "LANG",
+    "LC_",
+    "TERM",
+    "PIP_",
+    "SSL_",
+    "CURL_CA",
+    "REQUESTS_CA",
+    "GIT_SSL",
+    "HTTP_PROXY",
+    "HTTPS_PROXY",
+)
+PATH = "/usr/local/bin:/usr/bin:/bin"
 RUN_NOTEBOOK = """
 import sys
 import nbformat
@@ -110,40 +122,38 @@ def follow(
 
 def measure(repeats: int, seed: int) -> Report:
     """Both ways once; ``repeats`` is of no use here."""
-    subprocess.run(["make", "--silent", "wheels", f"BIN={Path(sys.executable).parent}"], cwd=ROOT, check=True)
     steps: dict[str, Followed] = {}
     with tempfile.TemporaryDirectory(prefix="physworld-new-user-") as folder:
         base = Path(folder)
-        steps["clone"] = follow(
-            ["git", "clone", "--quiet", ROOT.as_uri(), "physworld"], base, fresh(base / "home")
-        )
-        steps["demo"] = follow(["make", "demo"], base / "physworld", fresh(base / "home"), (INSTALLED, TABLE))
-    with tempfile.TemporaryDirectory(prefix="physworld-new-user-") as folder:
-        base = Path(folder)
-        steps |= _notebook(base, fresh(base / "home"))
+        clone, environment = base / "physworld", fresh(base / "home")
+        steps["clone"] = follow(["git", "clone", "--quiet", ROOT.as_uri(), clone.name], base, environment)
+        steps["demo"] = follow(["make", "demo"], clone, environment, (INSTALLED, TABLE))
+        follow(["make", "--silent", "wheels"], clone, environment)
+        notebook = base / "notebook"
+        notebook.mkdir()
+        steps |= _notebook(clone, notebook, fresh(notebook / "home"))
     return _report(steps, seed)
 
 
 def fresh(home: Path) -> dict[str, str]:
-    """The variables of somebody whose home is empty; without those that lead to what is installed here."""
+    """The variables of somebody who has just logged in, with an empty home."""
     home.mkdir(exist_ok=True)
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(MINE)}
-    own = str(Path(sys.executable).parent)
-    path = os.pathsep.join(part for part in kept["PATH"].split(os.pathsep) if part != own)
-    return {**kept, "PATH": path, "HOME": str(home)}
+    kept = {name: value for name, value in os.environ.items() if name.upper().startswith(KEPT)}
+    return {**kept, "PATH": PATH, "HOME": str(home)}
 
 
-def _notebook(base: Path, environment: Mapping[str, str]) -> dict[str, Followed]:
-    """An empty environment, the wheels, and the guide's notebook beside the sample scene."""
+def _notebook(clone: Path, base: Path, environment: Mapping[str, str]) -> dict[str, Followed]:
+    """An empty environment, the clone's wheels, and the guide's notebook beside the sample scene."""
     for part in (NOTEBOOK, Path("sample/soft_beam")):
         (base / part).parent.mkdir(parents=True, exist_ok=True)
-        (shutil.copytree if (ROOT / part).is_dir() else shutil.copy)(ROOT / part, base / part)
+        (shutil.copytree if (clone / part).is_dir() else shutil.copy)(clone / part, base / part)
     wheels = [
-        str(max((ROOT / "dist").glob(f"{name}*.whl"), key=lambda wheel: wheel.stat().st_mtime)) + extras
+        f"{wheel}{extras}"
         for name, extras in EXTRAS.items()
+        for wheel in (clone / "dist").glob(f"{name}*.whl")
     ]
     python = str(base / "venv" / "bin" / "python")
-    made = follow([sys.executable, "-m", "venv", "venv"], base, environment)
+    made = follow(["python3", "-m", "venv", "venv"], base, environment)
     pip = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *wheels, *KERNEL]
     installed = follow(pip, base, environment)
     book = [python, "-c", RUN_NOTEBOOK, str(base / NOTEBOOK), str((base / NOTEBOOK).parent)]
@@ -186,7 +196,8 @@ def _report(steps: Mapping[str, Followed], seed: int) -> Report:
         notes=[
             "Empty home, nothing cached: packages are fetched and installed, kernels compiled. `make demo` runs the "
             "shipped beam with the default settings, the notebook with its own small ones.",
-            "Packages came from an index on the machine itself, so that fetching them costs less than elsewhere.",
+            "An emptied environment (new home, new virtual environment, few variables) stands in for a bare machine; "
+            "packages came from an index on the machine itself, so that fetching them costs less than elsewhere.",
         ],
         seed=seed,
     )

@@ -2,11 +2,16 @@
 
 A texture is a function of the place in the undeformed body, so that it moves as painted material does. One light from
 above, no shadows, Lambert's law: brightness changes as a surface turns, which a tracker has to bear.
+
+A pixel is the mean over its area, as of a sensor: nine rays of which no two share a row or a column (rooks on a chess
+board), shifted by chance in every pixel (Cranley & Patterson 1976). A regular grid of rays would put every edge that
+runs along a row of pixels at the next ray, up to half a ray's distance away, all along it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -15,8 +20,8 @@ from physworld.arrays import Array
 from physworld.camera import Camera
 
 FAR_M = 10.0
-SAMPLES = 2
-"""Rays a pixel along each axis; their mean is the colour."""
+SAMPLES = 3
+"""Its square is the number of a pixel's rays; their mean is the colour."""
 
 SPECKLED, PLAIN, MARKER = 0, 1, 2
 """What a triangle is painted with: speckles of its material, one colour, or the picture of a marker."""
@@ -62,18 +67,45 @@ class Stage:
         self._grain = wp.array([surface.grain_m for surface in surfaces], dtype=wp.float32)
         self._marker = wp.array(np.full((1, 1), 255) if marker is None else marker, dtype=wp.uint8)
         self._table_m = table_m
+        self._own = [slice(*ends) for ends in pairwise(starts)]
+        self._bare: tuple[Camera, tuple[Array, Array, Array]] | None = None
 
-    def show(self, vertices: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    def show(self, vertices: Array, camera: Camera, seed: int = 0) -> tuple[Array, Array, Array]:
         """Colour (H, W, 3) uint8, depth along the axis (H, W) float32 [m], and the surface seen (H, W), -1 for none.
 
         Args:
             vertices: of all surfaces [m], (V, 3).
             camera: from where.
+            seed: of the shifts of the rays.
         """
+        found = [part.copy() for part in self._table(camera)]
+        for own in self._own:
+            pixels, distance = camera.project(vertices[own])
+            low, high = np.zeros(2, dtype=int), np.array([camera.width, camera.height])
+            if (distance > 0.0).all():
+                low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - 1, low, high)
+                high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + 1, low, high)
+            if (high > low).all():
+                box = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+                for whole, part in zip(found, self._cast_box(vertices, camera, seed, box), strict=True):
+                    whole[box[1] : box[3], box[0] : box[2]] = part
+        return found[0], found[1], found[2]
+
+    def _table(self, camera: Camera) -> tuple[Array, Array, Array]:
+        """What the camera sees where none of the surfaces is: it does not move, nor does the table."""
+        if self._bare is None or self._bare[0] is not camera:
+            nowhere = np.tile([0.0, 0.0, self._table_m - FAR_M], (len(self._rest), 1))
+            whole = (0, 0, camera.width, camera.height)
+            self._bare = (camera, self._cast_box(nowhere, camera, 0, whole))
+        return self._bare[1]
+
+    def _cast_box(
+        self, vertices: Array, camera: Camera, seed: int, box: tuple[int, int, int, int]
+    ) -> tuple[Array, Array, Array]:
+        """Colour, depth and surface of the pixels from left and top to before right and bottom."""
         mesh = wp.Mesh(points=wp.array(vertices, dtype=wp.vec3), indices=self._triangles)
-        pose = camera.world_to_camera
-        turn = wp.mat33(*pose[:3, :3].T.ravel().tolist())
-        size = (camera.height, camera.width)
+        turn = wp.mat33(*camera.world_to_camera[:3, :3].T.ravel().tolist())
+        size = (box[3] - box[1], box[2] - box[0])
         colour = wp.zeros(size, dtype=wp.vec3)
         depth = wp.zeros(size, dtype=wp.float32)
         seen = wp.zeros(size, dtype=wp.int32)
@@ -91,13 +123,13 @@ class Stage:
                 self._marker,
                 turn,
                 wp.vec3(*camera.centre.tolist()),
-                wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+                wp.vec4(camera.fx, camera.fy, camera.cx - box[0], camera.cy - box[1]),
                 self._table_m,
+                seed,
             ],
             outputs=[colour, depth, seen],
         )
-        pixels = np.clip(colour.numpy() * 255.0, 0.0, 255.0)
-        return pixels, depth.numpy(), seen.numpy()
+        return np.clip(colour.numpy() * 255.0, 0.0, 255.0), depth.numpy(), seen.numpy()
 
 
 @wp.func
@@ -122,6 +154,7 @@ def _cast(
     eye: wp.vec3,
     lens: wp.vec4,
     table: float,
+    seed: int,
     # out
     colour_out: wp.array2d(dtype=wp.vec3),
     depth_out: wp.array2d(dtype=wp.float32),
@@ -130,10 +163,15 @@ def _cast(
     row, column = wp.tid()
     light = wp.normalize(wp.vec3(0.3, -0.5, 0.8))
     total = wp.vec3(0.0, 0.0, 0.0)
+    chance = wp.rand_init(seed, row * 65536 + column)
+    shift_x = wp.randf(chance)
+    shift_y = wp.randf(chance)
     for sample in range(SAMPLES * SAMPLES + 1):
         # the last ray goes through the middle and measures
-        dx = (float(sample % SAMPLES) + 0.5) / float(SAMPLES)
-        dy = (float(sample // SAMPLES) + 0.5) / float(SAMPLES)
+        dx = float(sample) / float(SAMPLES * SAMPLES) + shift_x
+        dy = float(SAMPLES * (sample % SAMPLES) + sample // SAMPLES) / float(SAMPLES * SAMPLES) + shift_y
+        dx -= wp.floor(dx)
+        dy -= wp.floor(dy)
         if sample == SAMPLES * SAMPLES:
             dx = 0.5
             dy = 0.5

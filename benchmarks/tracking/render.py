@@ -43,7 +43,7 @@ def render(play: Play, folder: Path, cameras: int = 1, seed: int = 0) -> None:
             (folder / kind / str(number)).mkdir(parents=True, exist_ok=True)
         pattern = errors.pattern((camera.height, camera.width), rng)
         for frame, vertices in enumerate(play.vertices):
-            exact, depth, _ = stage.show(vertices, camera)
+            exact, depth, _ = stage.show(vertices, camera, frame)
             colour = errors.colour(exact, rng)
             cv2.imwrite(
                 str(folder / f"color/{number}/{frame}.png"),

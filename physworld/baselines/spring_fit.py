@@ -223,7 +223,18 @@ class Fitting:
         return (theta, last) if last < least else (best, least)
 
     def model(self, springs: Springs, reach: float, most: int, loss: float, started: float) -> SpringModel:
-        """What was found. Raises CalibrationError where no network could be simulated."""
+        """The fitted network.
+
+        Args:
+            springs: its network.
+            reach: longest spring over the body's spacing.
+            most: neighbours of a point.
+            loss: on the training frames [m].
+            started: loss before the descent [m].
+
+        Raises:
+            CalibrationError: no network could be simulated.
+        """
         if not np.isfinite(loss):
             raise CalibrationError(f"none of {self.simulations} networks could be simulated")
         spent = time.perf_counter() - self._begun

@@ -64,7 +64,18 @@ class Tried:
 
 
 class Search:
-    """State of one search."""
+    """State of one search.
+
+    Args:
+        scene: the recording, whose reach and speed bound the motions.
+        rivals: models that a motion shall separate; the first one's twin sets the grips' start.
+        sigma: deviation of the measurement per axis [m].
+        finer: the first rival's twin on finer cells; None: without.
+        cost: of a twin on the recording, after which the rivals' properties are reconciled; None: they are taken as
+            they are.
+        config: motions to try and simulations to spend.
+        simulations: that run the motions and count them.
+    """
 
     def __init__(
         self,

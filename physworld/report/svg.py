@@ -101,7 +101,15 @@ class Axes:
 def picture(
     width: float, height: float, title: str, *children: Child, kind: str = "", **attributes: str
 ) -> Html:
-    """An SVG element with a name for those who hear the page; ``kind`` is a further class."""
+    """An SVG element with a name for those who hear the page.
+
+    Args:
+        width, height: of its coordinates.
+        title: the name.
+        children: what is drawn.
+        kind: a further class.
+        attributes: further ones of the element.
+    """
     return tag(
         "svg", tag("title", title), *children, class_=f"chart {kind}".strip(),
         viewBox=f"0 0 {width:g} {height:g}", role="img", **attributes,

@@ -68,7 +68,7 @@ class Recordings:
     Attributes:
         fitted, held_out: in the order given.
         scene: those that are fitted as one scene, their training frames only; the scene itself where there is one.
-        split: of the joined scene.
+        split: of the joined scene. The constructor has the arguments of :func:`freeze`, for several scenes.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class JointSimulations(Simulations):
         progress: Progress | None = None,
         cancelled: Callable[[], bool] | None = None,
     ) -> None:
-        """``twin``: the lead's; ``budget``, ``refinement``: of its cells and of the trace's other resolutions."""
+        """``twin``: the lead's; ``budget``, ``refinement``: of cells; the other arguments of :class:`Simulations`."""
         super().__init__(recordings.lead.drive, runner, memory, progress, cancelled)
         self.recordings, self._budget = recordings, budget
         self._drives = [recording.drive for recording in recordings.fitted]

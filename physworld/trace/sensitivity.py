@@ -78,7 +78,7 @@ def numerical_directions(
     """Changes of the prediction (frames, N, 3) that are the solver's own, by name; and the twin on finer cells.
 
     Of a mesh of triangles the cells are what is supposed of the recording: it has no finer ones, and is its own.
-
+    ``base``: the prediction (frames, N, 3); other arguments as of :class:`physworld.trace.recordings.JointSimulations`.
     """
     frames = len(base)
     finer = twin

@@ -18,7 +18,7 @@ from scipy.optimize import minimize_scalar
 from physworld.arrays import Array
 from physworld.camera import Camera
 from physworld.errors import TrackingFailed
-from physworld.tracking.grips import DICTIONARIES
+from physworld.tracking.markers import DICTIONARIES
 from physworld.tracking.plane import Plane, facing
 from physworld.tracking.view import View, from_opencv
 

@@ -18,6 +18,8 @@ ROUNDS = 3
 LEAST_PIXELS = 6
 BAND_M = 0.015
 """From the patch's median; a patch of 1 cm that is seen at 60 degrees spans as much."""
+FLAT_SIGMAS = 3.5
+"""Robust deviations of a plane's own pixels: farther from it lies another surface."""
 
 
 def patch_depth(depth: Array, pixels: Array, spread: Array, inside: Array, expected: Array) -> Array:
@@ -86,6 +88,36 @@ def plane_in(depth: Array, camera: Camera, rows: Array, columns: Array) -> tuple
         miss = np.abs(inverse - design @ answer)
         weights = 1.0 / np.sqrt(1.0 + (miss / (2.0 * np.median(miss) + 1e-9)) ** 2)
     return float(answer[0]), float(answer[1]), float(answer[2])
+
+
+def flat_part(
+    depth: Array,
+    camera: Camera,
+    plane: tuple[float, float, float],
+    inner: tuple[Array, Array],
+    outer: tuple[Array, Array],
+) -> tuple[float, float, float]:
+    """The plane of those of the outer pixels that lie in the plane of the inner ones, as ``plane_in`` gives it.
+
+    Args:
+        depth: (H, W) [m], 0: none.
+        camera: see ``plane_in``.
+        plane: of the inner pixels.
+        inner, outer: rows and columns.
+    """
+
+    def misses(pixels: tuple[Array, Array], of: Array) -> tuple[Array, Array]:
+        rows, columns = (axis[depth[pixels] > 0] for axis in pixels)
+        design = np.stack([np.ones(len(rows)), columns + 0.5 - camera.cx, rows + 0.5 - camera.cy], axis=1)
+        return 1.0 / depth[rows, columns].astype(np.float64) - design @ of, design
+
+    found = np.array(plane)
+    bound = FLAT_SIGMAS * 1.4826 * float(np.median(np.abs(misses(inner, found)[0]))) + 1e-9
+    for _ in range(ROUNDS):
+        miss, design = misses(outer, found)
+        flat = np.abs(miss) < bound
+        found = found + np.linalg.lstsq(design[flat], miss[flat], rcond=None)[0]
+    return float(found[0]), float(found[1]), float(found[2])
 
 
 def on_plane(plane: tuple[float, float, float], camera: Camera, pixels: Array) -> Array:

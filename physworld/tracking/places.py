@@ -70,6 +70,13 @@ class Tracks:
 class FirstPlaces:
     """Depth of points in the first frame.
 
+    Args:
+        camera: whose picture it is.
+        mask: the object, (H, W) bool.
+        depth: (H, W) [m], 0: none.
+        pixels: (N, 2).
+        radius: half the side of the part of a patch whose depth counts [px].
+
     Attributes:
         camera: whose picture it is.
         pixels: (N, 2).

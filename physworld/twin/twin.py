@@ -293,12 +293,7 @@ class Twin:
         for known in active:
             problem = known.problem(problem, self)
         velocity = np.zeros_like(self.body.start) if from_rest else self.body.start_velocity
-        gripped = self
-        for known in active:
-            gripped = known.grips(gripped)
-        regions = soft_regions(self)
-        if regions:
-            gripped = with_touched_nodes(gripped, self.body.start)
+        gripped, regions = self.gripped(), soft_regions(self)
         held = held_paths(gripped, knots, controls)
         twists = () if self.natural is not None else twist_between_grips(gripped, knots, controls)
         problem = replace(problem, terms=(*problem.terms, *self._touching_itself(held.nodes), *twists))
@@ -311,6 +306,13 @@ class Twin:
         if self.natural is not None:
             problem = replace(problem, sections=sections_of(gripped, held, knots, controls))
         return Integration(problem, velocity, held, knots, frame_index)
+
+    def gripped(self) -> Twin:
+        """The twin whose grips prescribe the motion: as effects have them, and of soft grips all nodes they touch."""
+        gripped = self
+        for known in in_order(self.effects):
+            gripped = known.grips(gripped)
+        return with_touched_nodes(gripped, self.body.start) if soft_regions(self) else gripped
 
     def particles_at(self, nodes: Array) -> Array:
         """Particles (T, P, 3) of the carriers' trajectories (T, n, 3)."""

@@ -84,7 +84,17 @@ class Blend(torch.autograd.Function):
         depth: Tensor,
         canvas: Canvas,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw. Shapes (G, 2), (G, 3), (G,), (G, 3), (G,)."""
+        """Draw.
+
+        Args:
+            ctx: of the autograd function.
+            centre: of the projected Gaussians [px], (G, 2).
+            conic: upper triangle of the inverse covariances [1/px²], (G, 3).
+            opacity: (G,).
+            colour: (G, 3).
+            depth: along the camera's axis [m], (G,).
+            canvas: what is drawn on.
+        """
         given = [tensor.detach().numpy() for tensor in (centre, conic, opacity, colour, depth)]
         ctx.inputs = canvas.arrays(*given)
         ctx.canvas = canvas

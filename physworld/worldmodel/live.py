@@ -70,6 +70,10 @@ class LiveRollout:
             raise GraphInvalid(f"phi of shape {given.shape}, not {self._phi.shape}, or not finite")
         self._phi = given
 
+    def set_model(self, published: PublishedModel) -> None:
+        """From the next step on the same network at other strengths (:meth:`PublishedModel.at_strengths`)."""
+        self._published = published
+
     def step(self, controllers: Array) -> Array:
         """Move all controllers to (K, 3) [m] within one tick; the object vertices then, (n, 3) [m].
 

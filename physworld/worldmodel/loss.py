@@ -54,7 +54,7 @@ def unrolled_loss(model: WorldModel, window: Tensor, truth: Tensor, phi: Tensor)
 
 
 def plain_loss(model: WorldModel, window: Tensor, truth: Tensor, phi: Tensor) -> Tensor:
-    """A :class:`Loss` operation by operation, on any device."""
+    """A loss operation by operation, on any device; the arguments are those of :class:`Loss`."""
     device = model.norm.change.device
     model.zero_grad(set_to_none=True)
     loss = unrolled_loss(model, window.to(device), truth.to(device), phi.to(device))

@@ -9,12 +9,14 @@ Beside the network's tensors (``physworld.worldmodel.model.model``) a version ho
     start.controllers (h+1, K, 3) all controllers at those ticks [m]
     start.time (1,) float64       time of the first of these ticks [s]
     skin.index (N, 8) int64, skin.weight (N, 8)   tracked point = Σ_k weight · vertex[index]
+    phi.strengths.* where the demonstrations varied strengths: ``physworld.worldmodel.model.conditioning``
 
 and the facts (``architecture`` of the card): the ``WorldModelConfig``, ``dt_s``, ``ground_height_m`` (null:
 none), ``vertex_spacing_m``, ``edge_radius_m``, ``object_vertices`` n, ``control_vertices`` C, ``edges``, and ``phi``,
 the columns of Φ in their order, each with name, unit, whether it is logarithmic, whether the whole body shares it,
 and its root mean square over the training episodes; versions without the last have stiffness and density, both
-logarithms of ratios.
+logarithms of ratios. ``strengths`` are the varied strengths, each with its unit, the range that was covered and where
+the version stands; none in versions without them.
 
 A rollout starts with ``start.history`` and ``start.controllers``, or from rest: one frame h+1 times with
 still controllers. Its single-precision origin is the mean of the history's last frame; its z is the
@@ -24,7 +26,7 @@ ground's height where there is a ground.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -33,6 +35,7 @@ import torch
 
 from physworld.arrays import Array
 from physworld.worldmodel.errors import VersionUnreadable, WorldModelError
+from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.frame import GripFrame
 from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
@@ -60,6 +63,7 @@ class PublishedModel:
     start_controllers: Array
     start_time_s: float
     skin: Skin
+    strengths: Conditioning | None = None
 
     @property
     def spec(self) -> GraphSpec:
@@ -74,6 +78,19 @@ class PublishedModel:
     def phi_with(self, named: Mapping[str, float | Array]) -> Array:
         """The fine-tuned Φ (n, 2) with columns replaced by name, each by a number or by (n,)."""
         return with_named(self.columns, self.phi, named)
+
+    def at_strengths(self, named: Mapping[str, float]) -> PublishedModel:
+        """The same model at other strengths of effects, by name in their units; the others stay.
+
+        Raises:
+            ValueError: a strength that the demonstrations did not vary, or that lies outside of what they covered.
+        """
+        if self.strengths is None:
+            if named:
+                raise ValueError(f"there is no strength {min(named)!r}: the demonstrations varied none")
+            return self
+        model, strengths = self.strengths.moved(self.model, named)
+        return replace(self, model=model, strengths=strengths)
 
     def rollout(
         self,
@@ -162,6 +179,7 @@ class PublishedModel:
             | {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in single.items()}
             | {name: np.ascontiguousarray(value, dtype=np.int64) for name, value in whole.items()}
             | {"start.time": np.array([self.start_time_s], dtype=np.float64)}
+            | ({} if self.strengths is None else self.strengths.to_tensors())
         )
 
     def facts(self) -> dict[str, Any]:
@@ -180,6 +198,7 @@ class PublishedModel:
                 one.described(float(spread))
                 for one, spread in zip(self.columns, self.model.norm.properties, strict=True)
             ],
+            "strengths": [] if self.strengths is None else self.strengths.facts(),
         }
 
     @classmethod
@@ -242,6 +261,7 @@ class PublishedModel:
             start_controllers=tensors["start.controllers"].astype(np.float64),
             start_time_s=float(tensors["start.time"][0]),
             skin=Skin(tensors["skin.index"], tensors["skin.weight"].astype(np.float64)),
+            strengths=Conditioning.read(tensors, facts.get("strengths")),
         )
 
 

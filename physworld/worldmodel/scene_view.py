@@ -20,6 +20,7 @@ from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import clock_times, model_dt, resample, resample_smooth
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.finetune import Recording
+from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.graph import GraphSpec, build_graph
 from physworld.worldmodel.model.model import WorldModel
@@ -84,8 +85,17 @@ class SceneView:
             visible=self.scene.visible[taken],
         )
 
-    def published(self, model: WorldModel, phi: Array, phi_calibrated: Array) -> PublishedModel:
-        """The model with this scene's start and skin."""
+    def published(
+        self, model: WorldModel, phi: Array, phi_calibrated: Array, strengths: Conditioning | None = None
+    ) -> PublishedModel:
+        """The model with this scene's start and skin.
+
+        Args:
+            model: the trained network.
+            phi: properties of its vertices after fine-tuning, (n, P).
+            phi_calibrated: the same before it.
+            strengths: of traced effects, at which it stands; None: it has none.
+        """
         window = slice(self.first, self.first + self.history + 1)
         return PublishedModel(
             model=model,
@@ -95,6 +105,7 @@ class SceneView:
             start_controllers=self.controllers[window],
             start_time_s=float(self.times[self.first]),
             skin=self.skin,
+            strengths=strengths,
         )
 
 

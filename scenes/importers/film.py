@@ -17,6 +17,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.camera import MOST_PIXELS, Camera
+from physworld.tracking.boards import USUAL_FOCAL
 from physworld.tracking.view import View, from_opencv, to_opencv
 from physworld_scenes.errors import refused
 from physworld_scenes.importers.options import FolderImporter
@@ -35,8 +36,6 @@ HEADS = ((4, b"ftyp"), (0, b"\x1a\x45\xdf\xa3"), (8, b"AVI "))
 """Where and how MP4, Matroska and AVI begin."""
 COMPLETE = 0.95
 """Share of the frames that a film declares, below which it was cut short: some lists of edits drop a few."""
-USUAL_FOCAL = 1.1
-"""In longer sides of the picture, where nobody knows it."""
 LENS = ("width", "height", "fx", "fy", "cx", "cy")
 
 

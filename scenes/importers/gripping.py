@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,18 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
-from physworld.tracking.grips import RigidPath, colour_middles, logged, marker_corners, rigid_path, translated
+from physworld.tracking.grips import colour_middles, logged, translated
 from physworld.tracking.mask import Box
+from physworld.tracking.poses import marker_path
 from physworld.tracking.recording import Followed, patch_points
+from physworld.tracking.rigid import RigidPath, rigid_path
 from physworld.tracking.view import View, cloud_of
 from physworld_scenes.errors import refused
 
 GRIP_MARGIN_M = 0.01
+REACH_SHARE = 0.1
+"""Of the object's size, beyond the nearest point: what a gripper holds where nobody says."""
+LEAST_HELD_PX = 4
 MOST_LOG_BYTES = 64 << 20
 
 
@@ -60,7 +66,7 @@ def gripper_path(views: list[View], grip: GripFrom, times: Array) -> RigidPath:
     """
     if grip.marker is not None:
         number = None if grip.marker < 0 else grip.marker
-        return rigid_path(marker_corners(views, number, grip.dictionary))
+        return marker_path(views, number, grip.dictionary)
     if grip.patch is not None:
         box = grip.patch.within(views[0].camera.width, views[0].camera.height)
         return rigid_path(patch_points(views, box))
@@ -98,7 +104,12 @@ def _log(path: Path) -> tuple[Array, Array, Array | None]:
 
 
 def gripper_controllers(
-    view: View, grip: GripFrom, path: RigidPath, followed: Followed, warnings: list[str]
+    view: View,
+    grip: GripFrom,
+    path: RigidPath,
+    followed: Followed,
+    warnings: list[str],
+    margin: Callable[[Array], Array | float] = lambda held: GRIP_MARGIN_M,
 ) -> tuple[Array, list[dict[str, Any]]]:
     """Controllers (T, K, 3) [m], and the entry of ``grips``.
 
@@ -108,6 +119,7 @@ def gripper_controllers(
         path: of the gripper.
         followed: the object.
         warnings: what is not said is added.
+        margin: around what a box in the picture shows, a number or (3,) [m], by which pixels that is, (H, W) bool.
 
     Raises:
         SceneInvalid: the box around what is held shows nothing of the object.
@@ -118,27 +130,25 @@ def gripper_controllers(
         window = np.zeros((view.camera.height, view.camera.width), dtype=bool)
         window[box.top : box.bottom, box.left : box.right] = True
         mask = followed.masks[0]
-        held = cloud_of(view.camera, view.depth(0), window & mask if mask.size else window)[0]
-        if len(held) < 4:
+        shown = window & mask if mask.size else window
+        held = cloud_of(view.camera, view.depth(0), shown)[0]
+        if len(held) < LEAST_HELD_PX:
             raise refused(
                 "held", f"the box around what is held has {len(held)} pixels of the object with depth"
             )
-        region = np.stack([held.min(axis=0) - GRIP_MARGIN_M, held.max(axis=0) + GRIP_MARGIN_M])
+        around = margin(shown)
+        region = np.stack([held.min(axis=0) - around, held.max(axis=0) + around])
     if region is not None:
         corners = np.array(
             [[region[i, 0], region[j, 1], region[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         )
-        entry = {
-            "controllers": list(range(8)),
-            "region_min_m": region[0].tolist(),
-            "region_max_m": region[1].tolist(),
-        }
-        return path.carry(corners), [entry]
+        entry = {"region_min_m": region[0].tolist(), "region_max_m": region[1].tolist()}
+        return path.carry(corners), [{"controllers": list(range(8)), **entry}]
     controllers = path.carry(path.reference)
     gap = np.linalg.norm(followed.cloud[:, None] - controllers[0][None], axis=2).min()
     size = float(np.linalg.norm(np.ptp(followed.cloud, axis=0)))
-    radius = float(gap + 0.1 * size)
+    radius = float(gap + REACH_SHARE * size)
     warnings.append(
-        f"what the gripper holds is not said: all within {radius:.3f} m of the points that were followed on it is taken"
+        f"what the gripper holds is not said: all within {radius:.3g} m of what was followed on it is taken"
     )
     return controllers, [{"controllers": list(range(len(controllers[0]))), "radius_m": radius}]

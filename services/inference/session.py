@@ -1,7 +1,8 @@
 """One live session without its connection: limits on the controls, ticks, the frames that are sent.
 
 A frame is little-endian: uint32 tick, uint32 number of the last control message, float32 time [s], uint32 flags
-(1: the prediction had left the numbers and was set back), then float32 points (N, 3) and controllers (K, 3) [m].
+(1: the prediction had left the numbers and was set back; 2: the body is the twin's), then float32 points (N, 3) and
+controllers (K, 3) [m].
 A control message is uint32 its number, then float32 velocities [m/s], (G, 3) for the grips or (K, 3).
 """
 
@@ -16,18 +17,41 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.report.names import label
 from physworld.worldmodel.controls import grip_groups
 from physworld.worldmodel.live import LiveRollout
+from physworld.worldmodel.model.properties import PhiColumn
 from physworld.worldmodel.published import PublishedModel
 
 HEAD = struct.Struct("<IIfI")
-SET_BACK = 1
+SET_BACK, OF_TWIN = 1, 2
 SPEED_PER_SIZE, REACH_PER_SIZE = 4.0, 1.5
 """Largest speed [1/s] and distance of a grip from its start, in sizes of the body."""
 
 
 MOST_FACTOR = 100.0
 """Of a property of the body, and one over the least."""
+
+
+def strength_told(model: PublishedModel, column: PhiColumn) -> dict[str, Any]:
+    """A strength as a client learns of it: its unit, the range that the training covered, and the model's own value."""
+    assert model.strengths is not None
+    low, high = model.strengths.range_of(column)
+    value = model.strengths.quantities[column.name]
+    named = {"name": column.name, "label": label(column.name), "unit": column.unit}
+    return {**named, "low": low, "high": high, "value": value}
+
+
+def checked_strength(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> None:
+    """Raises ControlRefused for a strength that is no finite number, or outside of its bounds."""
+    if not _is_number(value):
+        raise ControlRefused(f"the strength {name!r} is not a finite number")
+    if not low <= value <= high:
+        raise ControlRefused(f"{name} is {value:g}; it may be {low:g} to {high:g}")
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
 
 
 class ControlRefused(ValueError):
@@ -55,6 +79,7 @@ class LiveSession:
         size = float(np.ptp(model.spec.rest_vertices, axis=0).max())
         self.speed_m_s, self.reach_m = SPEED_PER_SIZE * size, REACH_PER_SIZE * size
         self._start, self._flags = start, 0
+        self._strengths = () if model.strengths is None else model.strengths.columns
         self._rollout = LiveRollout(model)
         self._before = self._now = self._places()
 
@@ -68,6 +93,7 @@ class LiveSession:
             "speed_m_s": self.speed_m_s,
             "reach_m": self.reach_m,
             "factors": [column.name for column in self._model.columns],
+            "strengths": [strength_told(self._model, column) for column in self._strengths],
             "start": self._now[: -len(self._start)].astype(np.float32).tolist(),
         }
 
@@ -97,7 +123,7 @@ class LiveSession:
         They hold from the next tick on, and after a reset. Raises ControlRefused.
         """
         for name, factor in factors.items():
-            if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor):
+            if not _is_number(factor):
                 raise ControlRefused(f"the factor of {name!r} is not a finite number")
             if not 1 / MOST_FACTOR <= factor <= MOST_FACTOR:
                 raise ControlRefused(
@@ -108,6 +134,18 @@ class LiveSession:
         if unknown:
             raise ControlRefused(f"there is no property {unknown[0]!r}; there are {', '.join(columns)}")
         self._rollout.set_phi(self._model.phi + [math.log(factors.get(name, 1.0)) for name in columns])
+
+    def set_strengths(self, strengths: Mapping[str, Any]) -> None:
+        """Strengths of effects by name in their units, within what the model was trained over; the others as in it.
+
+        They hold from the next tick on, and after a reset. Raises ControlRefused.
+        """
+        for name, value in strengths.items():
+            checked_strength(name, value)
+        try:
+            self._rollout.set_model(self._model.at_strengths(strengths))
+        except ValueError as error:
+            raise ControlRefused(str(error)) from error
 
     def reset(self) -> None:
         """Back to the start."""
@@ -135,6 +173,28 @@ class LiveSession:
         tick = self._rollout.tick
         head = HEAD.pack(tick, number, max(tick - 1 + share, 0.0) * self.dt_s, self._flags)
         return head + ((1.0 - share) * self._before + share * self._now).astype("<f4").tobytes()
+
+    @property
+    def strengths(self) -> list[str]:
+        """Names of the strengths that the model was trained over."""
+        return [column.name for column in self._strengths]
+
+    @property
+    def tick_number(self) -> int:
+        """Ticks since the start."""
+        return self._rollout.tick
+
+    @property
+    def controllers(self) -> Array:
+        """Control points now [m], (K, 3)."""
+        places: Array = self._rollout.controllers
+        return places
+
+    def twin_frame(self, tick: int, vertices: Array, controllers: Array) -> bytes:
+        """The frame of the twin at a tick: its vertices (n, 3) under control points (K, 3) [m]."""
+        points = vertices if self._skin is None else self._skin.apply(vertices.astype(np.float64))
+        head = HEAD.pack(tick, 0, tick * self.dt_s, OF_TWIN)
+        return head + np.concatenate([points, controllers]).astype("<f4").tobytes()
 
     def sent(self, frame: bytes) -> None:
         """The client has this frame, and knows what its flags say; frames that were left out told nobody."""

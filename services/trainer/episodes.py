@@ -30,11 +30,12 @@ from physworld_workers.tasks.dataset import demonstration_of
 POLL_S = 0.5
 
 
-def column_of(one: StrengthRange) -> PhiColumn:
+def column_of(one: StrengthRange, unit: str = "") -> PhiColumn:
     """A strength as a column of Φ: its distance from the estimate in half-widths of its interval."""
     half = 0.5 * (one.high - one.low)
     return PhiColumn(
         name=f"{one.effect}.{one.name}",
+        unit=unit,
         logarithmic=False,
         shared=True,
         calibrated=one.value,
@@ -59,6 +60,7 @@ class Episodes:
         history: h: frames before the present one that a step sees.
         strengths: intervals of the twin's effects, of which each becomes a column of Φ.
         ground_friction: calibrated coefficient; None without a ground.
+        units: of the strengths, by the names of their columns.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class Episodes:
         history: int,
         strengths: Sequence[StrengthRange] = (),
         ground_friction: float | None = None,
+        units: Mapping[str, str] | None = None,
     ) -> None:
         self._context, self._stores, self._dataset_id = context, stores, dataset_id
         self._spec, self._history = spec, history
@@ -78,6 +81,7 @@ class Episodes:
         perturbed = dataset.config.effects != "as_found"
         varied = [one for one in strengths if perturbed and one.low < one.high]
         self._intervals = {column_of(one).name: (one.low, one.high) for one in varied}
+        units = units or {}
         demonstration = demonstration_of(dataset.config)
         sigma = demonstration.sigma_of("friction")
         friction: tuple[PhiColumn, ...] = ()
@@ -86,7 +90,8 @@ class Episodes:
             friction = (
                 PhiColumn(FRICTION, "1", shared=True, calibrated=ground_friction, limits=(-most, most)),
             )
-        self.columns = (*PROPERTIES, *friction, *(column_of(one) for one in varied))
+        own = (column_of(one, units.get(f"{one.effect}.{one.name}", "")) for one in varied)
+        self.columns = (*PROPERTIES, *friction, *own)
         self.reached = (0, 1)
 
     def track(self, index: int) -> Track:

@@ -25,10 +25,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from physworld.demonstrate.config import StrengthRange
+from physworld.demonstrate.properties import ranges_of
 from physworld.devices import torch_device
 from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
 from physworld.worldmodel.finetune import FineTuneResult, fine_tune
 from physworld.worldmodel.model import config as settings_of
+from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, first_episodes, train
 from physworld_schemas.model import TrainingConfig
@@ -75,6 +77,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         architecture.history,
         strengths,
         None if twin.ground_height_m is None else twin.ground_friction,
+        {f"{one.name}.{part.name}": part.unit for one in twin.effects for part in type(one).strengths(twin)},
     )
     started = time.perf_counter()
     trained = _train(context, stores, episodes, view, architecture, training)
@@ -98,7 +101,13 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     )
     tuning_s = time.perf_counter() - started
     context.begin(MEASURING)
-    published = view.published(trained.model.at_strengths(tuned.strengths), tuned.phi, phi)
+    covered = {f"{one.effect}.{one.name}": (one.low, one.high) for one in ranges_of(twin, strengths)}
+    published = view.published(
+        trained.model.at_strengths(tuned.strengths),
+        tuned.phi,
+        phi,
+        Conditioning.of(trained.model, tuned.strengths, covered),
+    )
     untuned = trained.model.at_strengths(dict.fromkeys(tuned.strengths, 0.0))
     before = view.published(untuned, phi, phi)
     measured = measure(view, published, before, _poll(context, "runs", MEASURING))

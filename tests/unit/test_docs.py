@@ -34,8 +34,8 @@ GENERATED = re.compile(
     r"<!-- (?:catalogue )?(?P<name>[\w. ]+?):? ?(?:begin )?-->.*?<!-- (?:(?P=name):? ?end|end of (?P=name)) -->",
     re.DOTALL,
 )
-MOST_WORDS = 27_600
-MOST_WORDS_OF_A_PAGE = 2_200
+MOST_WORDS = 23_000
+MOST_WORDS_OF_A_PAGE = 1_800
 ADDRESS = re.compile(r"`(GET|POST|PUT|PATCH|DELETE) (/[^`]*)`")
 
 

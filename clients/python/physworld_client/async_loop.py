@@ -58,8 +58,13 @@ class AsyncTraces(AsyncListed):
     ) -> Job:
         """Starts a trace; its job's output is the trace.
 
-        ``scene_ids`` are further recordings of the object, fitted together with the scene; ``held_out_scene_ids`` are
-        recordings that only the report sees.
+        Args:
+            scene_id: the recording.
+            config: settings of the trace.
+            fit: settings of its calibration.
+            fit_id: a ready fit whose twin is taken instead, where it fits.
+            scene_ids: further recordings of the object, fitted together with the scene.
+            held_out_scene_ids: recordings that only the report sees.
         """
         scenes = self._client.scenes
         first = await scenes.id_of(scene_id)
@@ -80,7 +85,14 @@ class AsyncTraces(AsyncListed):
         scene_id: str | None = None,
         verdict: str | None = None,
     ) -> AsyncListPage[Trace]:
-        """Traces, newest first."""
+        """Traces, newest first.
+
+        Args:
+            limit: items of a page.
+            cursor: ``next_cursor`` of the page before; None: the first page.
+            scene_id: only those of this scene.
+            verdict: only those with this verdict.
+        """
         scene = None if scene_id is None else await self._client.scenes.id_of(scene_id)
         return await self._page(
             lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene, verdict=verdict), cursor
@@ -212,7 +224,14 @@ class AsyncLoops(AsyncListed):
         model: str | None = None,
         state: str | None = None,
     ) -> AsyncListPage[Loop]:
-        """Loops, newest first."""
+        """Loops, newest first.
+
+        Args:
+            limit: items of a page.
+            cursor: ``next_cursor`` of the page before; None: the first page.
+            model: only those of the model with this name.
+            state: only those whose job is in this state.
+        """
         return await self._page(
             lambda at: calls.loop_list(limit=limit, cursor=at, model=model, state=state), cursor
         )

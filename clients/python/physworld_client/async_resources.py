@@ -69,11 +69,22 @@ class AsyncScenes(AsyncListed):
         """One scene."""
         return await self._client.send(calls.scene_get(await self.id_of(scene_id)))
 
+    async def update(self, scene_id: str, *, tags: tuple[str, ...]) -> Scene:
+        """Gives a scene these tags, in the place of those before. The recording itself never changes."""
+        return await self._client.send(calls.scene_patch(await self.id_of(scene_id), tags))
+
     async def list(
-        self, *, limit: int | None = None, cursor: str | None = None, kind: str | None = None
+        self,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+        kind: str | None = None,
+        tag: str | None = None,
     ) -> AsyncListPage[Scene]:
-        """Scenes, newest first."""
-        return await self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind), cursor)
+        """Scenes, newest first: all, those of a kind, those that have a tag."""
+        return await self._page(
+            lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind, tag=tag), cursor
+        )
 
 
 class AsyncFits(AsyncListed):
@@ -187,7 +198,15 @@ class AsyncModels(AsyncListed):
         description: str = "",
         tags: tuple[str, ...] = (),
     ) -> Job:
-        """Trains on a sealed dataset and publishes the next version of ``name``."""
+        """Trains on a sealed dataset and publishes the next version of ``name``.
+
+        Args:
+            name: of the model.
+            dataset_id: the dataset.
+            config: settings of the training.
+            description: of the version, for people.
+            tags: of the version.
+        """
         dataset = await self._client.datasets.id_of(dataset_id)
         return await self._client.send(calls.training_create(name, dataset, config, description, [*tags]))
 
@@ -225,7 +244,14 @@ class AsyncModels(AsyncListed):
         description: str | None = None,
         tags: tuple[str, ...] | None = None,
     ) -> ModelVersion:
-        """Changes description and tags of a version; what is None stays. Its files never change."""
+        """Changes description and tags of a version; its files never change.
+
+        Args:
+            name: of the model.
+            version: its number or an alias.
+            description: the new one; None: as it is.
+            tags: the new ones; None: as they are.
+        """
         return await self._client.send(calls.version_patch(name, version, description, tags))
 
     async def compare(self, name: str, a: int | str, b: int | str) -> ModelComparison:
@@ -323,7 +349,14 @@ class AsyncJobs(AsyncListed):
         state: str | None = None,
         kind: str | None = None,
     ) -> AsyncListPage[Job]:
-        """Jobs, newest first."""
+        """Jobs, newest first.
+
+        Args:
+            limit: items of a page.
+            cursor: ``next_cursor`` of the page before; None: the first page.
+            state: only those in this state.
+            kind: only those of this kind.
+        """
         return await self._page(
             lambda at: calls.job_list(limit=limit, cursor=at, state=state, kind=kind), cursor
         )

@@ -70,17 +70,19 @@ class LiveSession:
         """Puts the body back to its start; velocities that were set go on for their 0.3 s."""
         self._send(live_frames.RESET)
 
-    def set_factors(self, factors: Mapping[str, float]) -> None:
+    def set_factors(self, factors: Mapping[str, float], strengths: Mapping[str, float] | None = None) -> None:
         """Gives the body other properties from the next tick on, also after a reset.
 
         Args:
             factors: relative to the model's own, 0.01 to 100, by the names in ``start.factors``; one that is not given
                 is as in the model. The service ends the session where it cannot take them.
+            strengths: of effects, in their units and within their ranges, by the names in ``start.strengths``; one
+                that is not given is the model's own.
 
         Raises:
             LiveSessionEnded: the session is over.
         """
-        self._send(live_frames.write_factors(factors))
+        self._send(live_frames.write_factors(factors, strengths or {}))
 
     def _send(self, message: bytes | str) -> None:
         try:

@@ -32,6 +32,24 @@ _TICKET = TypeAdapter(LiveTicket)
 
 
 @dataclass(frozen=True)
+class LiveStrength:
+    """A strength of an effect that a session can change.
+
+    Attributes:
+        name: the effect and its strength, or ``ground.friction``.
+        unit: SI unit of the others.
+        low, high: the range that the model's training covered.
+        value: the model's own.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    value: float
+
+
+@dataclass(frozen=True)
 class LiveStart:
     """What holds for the whole session.
 
@@ -43,6 +61,7 @@ class LiveStart:
         speed_m_s: speeds beyond are cut.
         reach_m: a grip stops that far from its start, along each axis.
         factors: properties that can be changed; none where the service is older than they are.
+        strengths: of effects, those that the model was trained over.
     """
 
     dt_s: float
@@ -52,6 +71,7 @@ class LiveStart:
     speed_m_s: float
     reach_m: float
     factors: tuple[str, ...] = ()
+    strengths: tuple[LiveStrength, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -98,10 +118,13 @@ def address(base_url: str, ticket: LiveTicket, frames: int, part: Part) -> str:
     return f"{base_url.replace('http', 'ws', 1)}{ticket.path}&{query}"
 
 
-def write_factors(factors: Mapping[str, float]) -> str:
-    """Properties of the body relative to the model's, by name."""
+def write_factors(factors: Mapping[str, float], strengths: Mapping[str, float]) -> str:
+    """Properties of the body relative to the model's, and strengths of effects in their units, by name."""
     named = {name: float(factor) for name, factor in factors.items()}
-    return json.dumps({"type": "factors", "factors": named})
+    message: dict[str, object] = {"type": "factors", "factors": named}
+    if strengths:
+        message["strengths"] = {name: float(value) for name, value in strengths.items()}
+    return json.dumps(message)
 
 
 def read_start(message: bytes | str) -> LiveStart:
@@ -116,6 +139,10 @@ def read_start(message: bytes | str) -> LiveStart:
             speed_m_s=float(ready["speed_m_s"]),
             reach_m=float(ready["reach_m"]),
             factors=tuple(map(str, ready.get("factors", ()))),
+            strengths=tuple(
+                LiveStrength(one["name"], one["unit"], *(float(one[key]) for key in ("low", "high", "value")))
+                for one in ready.get("strengths", ())
+            ),
         )
     except (ValueError, KeyError, TypeError) as error:
         raise PhysWorldError(f"a live session began with {message[:120]!r}: {reason(error)}") from error

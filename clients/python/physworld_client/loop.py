@@ -59,8 +59,13 @@ class Traces(Listed):
     ) -> Job:
         """Starts a trace; its job's output is the trace.
 
-        ``scene_ids`` are further recordings of the object, fitted together with the scene; ``held_out_scene_ids`` are
-        recordings that only the report sees.
+        Args:
+            scene_id: the recording.
+            config: settings of the trace.
+            fit: settings of its calibration.
+            fit_id: a ready fit whose twin is taken instead, where it fits.
+            scene_ids: further recordings of the object, fitted together with the scene.
+            held_out_scene_ids: recordings that only the report sees.
         """
         scenes = self._client.scenes
         first = scenes.id_of(scene_id)
@@ -81,7 +86,14 @@ class Traces(Listed):
         scene_id: str | None = None,
         verdict: str | None = None,
     ) -> ListPage[Trace]:
-        """Traces, newest first."""
+        """Traces, newest first.
+
+        Args:
+            limit: items of a page.
+            cursor: ``next_cursor`` of the page before; None: the first page.
+            scene_id: only those of this scene.
+            verdict: only those with this verdict.
+        """
         scene = None if scene_id is None else self._client.scenes.id_of(scene_id)
         return self._page(
             lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene, verdict=verdict), cursor
@@ -211,7 +223,14 @@ class Loops(Listed):
         model: str | None = None,
         state: str | None = None,
     ) -> ListPage[Loop]:
-        """Loops, newest first."""
+        """Loops, newest first.
+
+        Args:
+            limit: items of a page.
+            cursor: ``next_cursor`` of the page before; None: the first page.
+            model: only those of the model with this name.
+            state: only those whose job is in this state.
+        """
         return self._page(
             lambda at: calls.loop_list(limit=limit, cursor=at, model=model, state=state), cursor
         )

@@ -70,11 +70,20 @@ class Scenes(Listed):
         """One scene."""
         return self._client.send(calls.scene_get(self.id_of(scene_id)))
 
+    def update(self, scene_id: str, *, tags: tuple[str, ...]) -> Scene:
+        """Gives a scene these tags, in the place of those before. The recording itself never changes."""
+        return self._client.send(calls.scene_patch(self.id_of(scene_id), tags))
+
     def list(
-        self, *, limit: int | None = None, cursor: str | None = None, kind: str | None = None
+        self,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+        kind: str | None = None,
+        tag: str | None = None,
     ) -> ListPage[Scene]:
-        """Scenes, newest first."""
-        return self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind), cursor)
+        """Scenes, newest first: all, those of a kind, those that have a tag."""
+        return self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind, tag=tag), cursor)
 
 
 class Fits(Listed):
@@ -186,7 +195,15 @@ class Models(Listed):
         description: str = "",
         tags: tuple[str, ...] = (),
     ) -> Job:
-        """Trains on a sealed dataset and publishes the next version of ``name``."""
+        """Trains on a sealed dataset and publishes the next version of ``name``.
+
+        Args:
+            name: of the model.
+            dataset_id: the dataset.
+            config: settings of the training.
+            description: of the version, for people.
+            tags: of the version.
+        """
         dataset = self._client.datasets.id_of(dataset_id)
         return self._client.send(calls.training_create(name, dataset, config, description, [*tags]))
 
@@ -224,7 +241,14 @@ class Models(Listed):
         description: str | None = None,
         tags: tuple[str, ...] | None = None,
     ) -> ModelVersion:
-        """Changes description and tags of a version; what is None stays. Its files never change."""
+        """Changes description and tags of a version; its files never change.
+
+        Args:
+            name: of the model.
+            version: its number or an alias.
+            description: the new one; None: as it is.
+            tags: the new ones; None: as they are.
+        """
         return self._client.send(calls.version_patch(name, version, description, tags))
 
     def compare(self, name: str, a: int | str, b: int | str) -> ModelComparison:
@@ -322,7 +346,14 @@ class Jobs(Listed):
         state: str | None = None,
         kind: str | None = None,
     ) -> ListPage[Job]:
-        """Jobs, newest first."""
+        """Jobs, newest first.
+
+        Args:
+            limit: items of a page.
+            cursor: ``next_cursor`` of the page before; None: the first page.
+            state: only those in this state.
+            kind: only those of this kind.
+        """
         return self._page(lambda at: calls.job_list(limit=limit, cursor=at, state=state, kind=kind), cursor)
 
     def retry(self, job_id: str) -> Job:

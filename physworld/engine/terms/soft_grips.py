@@ -200,6 +200,11 @@ class BoundSoftGrips(BoundTerm):
     friction_per_s: float = 0.0
     _paced_s: float = field(default=0.0)
 
+    @property
+    def paths(self) -> tuple[wp.array, wp.array]:
+        """Positions [m] and velocities [m/s] of the nodes' paths at the frames, (T, 3k) each."""
+        return self.model[2], self.model[3]
+
     def pace(self, time_step_s: float) -> None:
         """The springs' implicit step of this length."""
         if time_step_s == self._paced_s:

@@ -215,6 +215,11 @@ class SteppedRun(ABC):
         self.force.zero_()
         self._chunks: dict[int, Chunk] = {}
 
+    @property
+    def paths(self) -> tuple[wp.array, wp.array]:
+        """Positions [m] and velocities [m/s] of the held nodes at the times, (T, 3k) each."""
+        return self._nodes[2], self._nodes[3]
+
     def advance(self, frame: int, stages: int | None = None) -> Array:
         """Integrate from ``times[frame]`` to the next; positions there, (n, 3) [m].
 

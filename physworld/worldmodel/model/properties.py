@@ -27,7 +27,7 @@ class PhiColumn:
 
     Attributes:
         name: unique within a model.
-        unit: SI unit of the quantity; of strengths the effect's registry has it and this is empty.
+        unit: SI unit of the quantity.
         logarithmic: whether the column is log(quantity / calibrated), else (quantity - calibrated) / ``half_width``.
         shared: whether it is one number for the whole body.
         calibrated: the quantity where the column is 0; None for a field that differs from vertex to vertex.

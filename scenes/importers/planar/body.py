@@ -8,20 +8,17 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.tracking.grips import RigidPath
 from physworld.tracking.recording import Followed, thinned
+from physworld.tracking.rigid import RigidPath
 from physworld.tracking.view import View, cloud_of
 from physworld_scenes.errors import refused
 from physworld_scenes.importers.film import Filmed
-from physworld_scenes.importers.gripping import GripFrom, gripper_path
+from physworld_scenes.importers.gripping import GripFrom, gripper_controllers, gripper_path
 from physworld_scenes.importers.planar.place import Placed, straight_box
 
 RODS, SHEETS, SOLIDS = ("rope", "rod", "branched_rope"), ("sheet",), ("beam", "block", "blob", "toy")
 MOST_FILLING, LAYERS = 20_000, 3
 GRIP_MARGIN_PX = 3.0
-REACH_SHARE = 0.1
-"""Of the object's size, beyond the nearest point: what a gripper holds where nobody says."""
-LEAST_HELD_PX = 4
 
 
 def behind_m(kind: str, body: dict[str, Any]) -> float:
@@ -81,7 +78,11 @@ def gripper_way(placed: Placed, small: View, factor: float, grip: GripFrom, time
         return gripper_path([placed.view], grip, times)
     way = gripper_path([small], grip, times)
     return replace(
-        way, places=way.places / factor, reference=way.reference / factor, misfit_m=way.misfit_m / factor
+        way,
+        places=way.places / factor,
+        reference=way.reference / factor,
+        misfit_m=way.misfit_m / factor,
+        draws=way.draws / np.repeat([1.0, factor], 3),
     )
 
 
@@ -115,29 +116,10 @@ def controllers_of(
     Raises:
         SceneInvalid: the box around what is held shows nothing of the object.
     """
-    size = float(np.linalg.norm(np.ptp(followed.cloud, axis=0)))
-    region = None if grip.held_m is None else np.array(grip.held_m, dtype=np.float64)
-    if grip.held_px is not None:
-        camera, mask = placed.view.camera, followed.masks[0]
-        box = grip.held_px.within(camera.width, camera.height)
-        window = np.zeros_like(mask)
-        window[box.top : box.bottom, box.left : box.right] = True
-        held = cloud_of(camera, placed.view.depth(0), window & mask)[0]
-        if len(held) < LEAST_HELD_PX:
-            raise refused("held", f"the box around what is held has {len(held)} pixels of the object")
-        margin = GRIP_MARGIN_PX * placed.pixel_m(window & mask)
-        across = (2.0 * behind + margin) * np.abs(placed.axes[2])
-        region = np.stack([held.min(axis=0) - margin - across, held.max(axis=0) + margin + across])
-    if region is not None:
-        corners = np.array(
-            [[region[i, 0], region[j, 1], region[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-        )
-        entry = {"region_min_m": region[0].tolist(), "region_max_m": region[1].tolist()}
-        return way.carry(corners), [{"controllers": list(range(8)), **entry}]
-    controllers = way.carry(way.reference)
-    gap = np.linalg.norm(followed.cloud[:, None] - controllers[0][None], axis=2).min()
-    radius = float(gap + REACH_SHARE * size)
-    warnings.append(
-        f"what the gripper holds is not said: all within {radius:.3g} m of what was followed on it is taken"
-    )
-    return controllers, [{"controllers": list(range(len(controllers[0]))), "radius_m": radius}]
+
+    def margin(held: Array) -> Array:
+        near = GRIP_MARGIN_PX * placed.pixel_m(held)
+        around: Array = near + (2.0 * behind + near) * np.abs(placed.axes[2])
+        return around
+
+    return gripper_controllers(placed.view, grip, way, followed, warnings, margin)

@@ -83,7 +83,18 @@ class Placed:
 
 
 def placed_on(filmed: Filmed, told: PlaneFrom, up: str | None, warnings: list[str]) -> Placed:
-    """The recording on the plane that a board or a length tells."""
+    """The recording on the plane that a board or a length tells.
+
+    Args:
+        filmed: the recording.
+        told: what tells the plane.
+        up: which of the plane's axes points up; None: y, which is said in the warnings.
+        warnings: what was guessed is added.
+
+    Raises:
+        SceneInvalid: neither or both tell the plane, the length is too short, or up is no axis.
+        TrackingFailed: the board is not found or moves.
+    """
     view = filmed.view
     focal = "given" if filmed.lens_known else "taken as usual"
     facts: dict[str, Any] = {}

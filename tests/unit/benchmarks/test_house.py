@@ -6,7 +6,15 @@ import ast
 
 import pytest
 
-from benchmarks.house import functions, told_elsewhere, wants_args
+from benchmarks.house import (
+    GENERATED,
+    PRODUCT,
+    ROOT,
+    functions,
+    told_elsewhere,
+    tracked,
+    wants_args,
+)
 
 MODULE = '''
 Json = Annotated[bool, typer.Option(help="As JSON.")]
@@ -107,3 +115,17 @@ def test_a_base_class_that_tells_nothing_covers_nothing() -> None:
     assert [function.name for function, owner in functions(derived) if wants_args(function, owner, told)] == [
         "f"
     ]
+
+
+def test_every_public_function_of_the_product_with_four_parameters_has_a_section() -> None:
+    texts = {path: (ROOT / path).read_text() for path in tracked(ROOT) if path.parts[0] in PRODUCT}
+    modules = {path: ast.parse(text) for path, text in texts.items()}
+    told = told_elsewhere(modules.values())
+    bare = [
+        f"{path}:{function.lineno} {function.name}"
+        for path, module in modules.items()
+        if not texts[path].startswith(GENERATED)
+        for function, owner in functions(module)
+        if wants_args(function, owner, told)
+    ]
+    assert len(modules) > 600 and bare == []

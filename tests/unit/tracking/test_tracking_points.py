@@ -7,10 +7,11 @@ import pytest
 from tracking_pictured import BOTTOM, COVERED, LEFT, RIGHT, TOP, affine, frame_of, view
 
 from physworld.errors import TrackingFailed
-from physworld.tracking.grips import kabsch, logged, rigid_path
+from physworld.tracking.grips import logged
 from physworld.tracking.mask import Box, mask_in_box
 from physworld.tracking.places import TrackConfig
 from physworld.tracking.points import follow
+from physworld.tracking.rigid import kabsch, rigid_path
 
 pytestmark = pytest.mark.slow
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from held_bar import SMALL, graph
 from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.finetune import Recording, fine_tune
+from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.config import FineTuneConfig, TrainingConfig
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
@@ -290,3 +292,32 @@ def test_a_column_goes_from_quantities_to_values_and_back() -> None:
         assert column.quantity_of(column.column_of(1.7)) == pytest.approx(1.7)
     with pytest.raises(ValueError, match="'stiffness' has no single calibrated value"):
         PROPERTIES[0].column_of(1e5)
+
+
+def test_a_version_moves_among_the_strengths_that_its_network_learned(
+    with_strength: WorldModel, published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    """Through its files, as the same network fixed at the other strengths; nothing moves beyond what was covered."""
+    covered = {"drag.rate": (-1.0, 1.5)}
+    stands = Conditioning.of(with_strength, at(0.2, 0.0), covered)
+    version = dataclasses.replace(published, model=with_strength.at_strengths(at(0.2, 0.0)), strengths=stands)
+    read = PublishedModel.from_tensors(version.to_tensors(), json.loads(json.dumps(version.facts())))
+    assert [one["name"] for one in version.facts()["strengths"]] == ["drag.rate", "wind.speed"]
+    assert version.facts()["strengths"][0]["range"] == [-1.0, 1.5]
+    assert read.strengths is not None and read.strengths.quantities["drag.rate"] == pytest.approx(0.2)
+    controllers = episodes[1]["controllers"].astype(np.float64)
+    moved = read.at_strengths({"drag.rate": 1.4}).rollout(controllers)
+    direct = dataclasses.replace(published, model=with_strength.at_strengths(at(1.4, 0.0)))
+    assert moved == pytest.approx(direct.rollout(controllers), abs=2e-6)
+    assert np.abs(moved - read.rollout(controllers)).max() > 1e-4, "the strength does nothing"
+    back = read.at_strengths({"drag.rate": 1.4}).at_strengths({"drag.rate": 0.2})
+    assert back.rollout(controllers) == pytest.approx(read.rollout(controllers), abs=2e-6)
+    with pytest.raises(ValueError, match=r"drag.rate is 1.6; the demonstrations covered -1 to 1.5"):
+        read.at_strengths({"drag.rate": 1.6})
+    with pytest.raises(ValueError, match=r"no strength 'wind'; there are drag.rate, wind.speed"):
+        read.at_strengths({"wind": 0.0})
+    with pytest.raises(ValueError, match="the demonstrations varied none"):
+        published.at_strengths({"drag.rate": 0.1})
+    cut = version.to_tensors() | {"phi.strengths.skip": np.zeros((3, 1), np.float32)}
+    with pytest.raises(VersionUnreadable, match=r"phi.strengths.skip \(3, 1\)"):
+        PublishedModel.from_tensors(cut, version.facts())

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from dashboard_served import PAGE, browser_at, from_page, login
 from fastapi import FastAPI
 from serving import serve
 from sqlalchemy import select
@@ -23,8 +24,6 @@ from physworld_storage.settings import Settings
 from physworld_storage.tables import SessionRow, utc_now
 
 pytestmark = pytest.mark.slow
-
-PAGE = {"accept": "text/html"}
 
 
 @pytest.fixture
@@ -51,27 +50,6 @@ def app(settings: Settings, database: Database) -> FastAPI:
 def client(app: FastAPI) -> Iterator[httpx.Client]:
     with serve(app) as origin, browser_at(origin) as client:
         yield client
-
-
-def browser_at(origin: str) -> httpx.Client:
-    """What a browser sends when a person opens a page."""
-    return httpx.Client(base_url=origin, headers=PAGE)
-
-
-def from_page(client: httpx.Client) -> dict[str, str]:
-    """What a browser adds when a form of ours is sent."""
-    return {"origin": str(client.base_url).rstrip("/")}
-
-
-def login(
-    client: httpx.Client, database: Database, role: api_keys.Role = "write", to: str = "/dashboard/"
-) -> str:
-    """Log in with a new key; where the answer leads to."""
-    with database.session() as session:
-        _, token = api_keys.create_key(session, "person", role)
-    answer = client.post("/dashboard/login", data={"key": token, "next": to}, headers=from_page(client))
-    assert answer.status_code == 303
-    return answer.headers["location"]
 
 
 def test_every_route_but_login_logout_and_static_needs_a_session(app: FastAPI, client: httpx.Client) -> None:

@@ -2,63 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import httpx
 import pytest
 from checked import REPORT
-from fastapi import FastAPI
-from serving import serve
-from test_dashboard_access import browser_at, login
+from dashboard_served import Served, from_page, work
 from tiny_scene import register, tiny_scene
 
-from physworld_services.dashboard import mount
-from physworld_services.stores import Stores
 from physworld_storage import checks
-from physworld_storage.database import Database, open_database
-from physworld_storage.jobs import leases
-from physworld_storage.settings import Settings
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[tuple[Settings, Database, Stores]]:
-    settings = Settings(data_dir=tmp_path)
-    database = open_database(settings)
-    database.upgrade()
-    yield settings, database, Stores(settings)
-    database.dispose()
-
-
-@pytest.fixture
-def client(world: tuple[Settings, Database, Stores]) -> Iterator[httpx.Client]:
-    app = FastAPI()
-    mount(app, *world)
-    with serve(app) as origin, browser_at(origin) as client:
-        login(client, world[1])
-        yield client
-
-
-def test_the_button_of_the_card_starts_a_check_and_the_card_shows_its_answer(
-    client: httpx.Client, world: tuple[Settings, Database, Stores]
-) -> None:
-    _, database, stores = world
+def test_the_button_of_the_card_starts_a_check_and_the_card_shows_its_answer(dashboard: Served) -> None:
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     scene = register(tiny_scene(), database, stores.artifacts)
     page = client.get(f"/dashboard/scenes/{scene}").text
     card = page.partition('id="check"')[2].partition("</section>")[0]
     assert "Not checked yet" in card and 'action="/dashboard/start/check"' in card
     assert f'name="scene_id" value="{scene}"' in card
-    own = {"origin": str(client.base_url).rstrip("/")}
+    own = from_page(client)
     started = client.post("/dashboard/start/check", data={"scene_id": scene}, headers=own)
     assert started.status_code == 303
     job_page = started.headers["location"]
     assert "follow its job" in client.get(f"/dashboard/scenes/{scene}").text
-    with database.session() as session:
-        (waiting,) = leases.publishable(session)
-        lease = leases.claim(session, waiting.shard_id, "test", 60.0)
-        assert lease is not None and leases.complete(session, lease, {"report": REPORT})
+    work(database, lambda lease: {"report": REPORT})
     card = client.get(f"/dashboard/scenes/{scene}").text.partition('id="check"')[2].partition("</section>")[0]
     for text in (
         "Young&#39;s modulus", "190,000 to 210,000", "air drag linear", "only if large", "4.25 1/s", "never",
@@ -78,15 +44,13 @@ def test_the_button_of_the_card_starts_a_check_and_the_card_shows_its_answer(
     assert "Not checked yet" in client.get(f"/dashboard/scenes/{scene}").text
 
 
-def test_the_form_of_a_check_takes_other_settings(
-    client: httpx.Client, world: tuple[Settings, Database, Stores]
-) -> None:
-    _, database, stores = world
+def test_the_form_of_a_check_takes_other_settings(dashboard: Served) -> None:
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     scene = register(tiny_scene(), database, stores.artifacts)
     form = client.get(f"/dashboard/start/check?scene_id={scene}").text
     for field in ("config.noise_m", "config.discrepancy_share", "config.motions", "config.candidates"):
         assert f'name="{field}"' in form, field
-    own = {"origin": str(client.base_url).rstrip("/")}
+    own = from_page(client)
     sent = {"scene_id": scene, "config.noise_m": "0.002", "config.motions": "0"}
     assert client.post("/dashboard/start/check", data=sent, headers=own).status_code == 303
     wrong = client.post("/dashboard/start/check", data={**sent, "config.noise_m": "-1"}, headers=own)

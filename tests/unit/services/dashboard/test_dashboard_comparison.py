@@ -5,22 +5,16 @@ from __future__ import annotations
 import html
 import json
 import re
-from collections.abc import Iterator
-from pathlib import Path
 
 import httpx
 import pytest
-from fastapi import FastAPI
-from serving import serve
-from test_dashboard_access import browser_at, login
+from dashboard_served import Served
+from sqlalchemy.orm import Session
 
 from physworld_schemas.base import Lineage
 from physworld_schemas.model import TrainingConfig
-from physworld_services.dashboard import mount
 from physworld_services.stores import Stores
 from physworld_storage import registry
-from physworld_storage.database import open_database
-from physworld_storage.settings import Settings
 
 CARD = {
     "intended_use": "Predict <this> object.",
@@ -31,44 +25,40 @@ STRENGTHS = {"air_drag_linear.rate_per_s": {"calibrated": 1.9, "ci95": [1.6, 2.2
 
 
 @pytest.fixture
-def client(tmp_path: Path) -> Iterator[httpx.Client]:
+def client(dashboard: Served) -> httpx.Client:
     """A browser on a dashboard with two ready versions of ``beam``, one of ``lonely``, and ``lost``, which diverged."""
-    settings = Settings(data_dir=tmp_path)
-    database = open_database(settings)
-    database.upgrade()
-    stores = Stores(settings)
-    with database.session() as session:
-        for name, error_m in (
-            ("beam", 0.004),
-            ("beam", 0.0031),
-            ("beam", 0.0035),
-            ("lonely", 0.001),
-            ("lost", 0.752),
-        ):
-            curves = {name: [error_m, error_m, None] for name in ("twin", "world_model_finetuned", "static")}
-            table = {
-                "track_m": dict.fromkeys(curves, error_m) | {"static": 0.1},
-                "ci95": {"track_m": {name: [0.9 * error_m, 1.1 * error_m] for name in curves}},
-                "frames": [10, 13],
-                "per_frame": {"times_s": [0.3, 0.4, 0.5], "track_m": curves},
-            }
-            row = registry.allot_version(session, name, config=TrainingConfig(seed=round(1e5 * error_m)))
-            registry.publish(
-                session,
-                name,
-                row.version,
-                artifacts=[stores.artifacts.put_bytes(json.dumps(CARD).encode(), "card.json")],
-                sha256="e" * 64,
-                metrics={"held_out": table, "fine_tuning": {"strengths": STRENGTHS}},
-                lineage=Lineage(),
-            )
-        registry.set_alias(session, "beam", "champion", 2)
-    app = FastAPI()
-    mount(app, settings, database, stores)
-    with serve(app) as origin, browser_at(origin) as browser:
-        login(browser, database)
-        yield browser
-    database.dispose()
+    with dashboard.database.session() as session:
+        publish_all(session, dashboard.stores)
+    return dashboard.client
+
+
+def publish_all(session: Session, stores: Stores) -> None:
+    """The versions that the browser looks at."""
+    for name, error_m in (
+        ("beam", 0.004),
+        ("beam", 0.0031),
+        ("beam", 0.0035),
+        ("lonely", 0.001),
+        ("lost", 0.752),
+    ):
+        curves = {name: [error_m, error_m, None] for name in ("twin", "world_model_finetuned", "static")}
+        table = {
+            "track_m": dict.fromkeys(curves, error_m) | {"static": 0.1},
+            "ci95": {"track_m": {name: [0.9 * error_m, 1.1 * error_m] for name in curves}},
+            "frames": [10, 13],
+            "per_frame": {"times_s": [0.3, 0.4, 0.5], "track_m": curves},
+        }
+        row = registry.allot_version(session, name, config=TrainingConfig(seed=round(1e5 * error_m)))
+        registry.publish(
+            session,
+            name,
+            row.version,
+            artifacts=[stores.artifacts.put_bytes(json.dumps(CARD).encode(), "card.json")],
+            sha256="e" * 64,
+            metrics={"held_out": table, "fine_tuning": {"strengths": STRENGTHS}},
+            lineage=Lineage(),
+        )
+    registry.set_alias(session, "beam", "champion", 2)
 
 
 def test_two_versions_are_held_side_by_side(client: httpx.Client) -> None:

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from datetime import UTC, datetime
-from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-from fastapi import FastAPI
-from serving import serve
-from test_dashboard_access import browser_at, login
+from dashboard_served import Served, from_page, work
 from tiny_scene import register, tiny_scene
 
 from physworld_schemas.video import Video, VideoConfig
-from physworld_services.dashboard import mount
 from physworld_services.dashboard.pages_videos import page_of
-from physworld_services.stores import Stores
 from physworld_storage import videos
-from physworld_storage.database import Database, open_database
-from physworld_storage.jobs import leases
-from physworld_storage.settings import Settings
 
 pytestmark = pytest.mark.slow
 
@@ -39,45 +30,21 @@ REPORT = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[tuple[Settings, Database, Stores]]:
-    settings = Settings(data_dir=tmp_path)
-    database = open_database(settings)
-    database.upgrade()
-    yield settings, database, Stores(settings)
-    database.dispose()
-
-
-@pytest.fixture
-def client(world: tuple[Settings, Database, Stores]) -> Iterator[httpx.Client]:
-    app = FastAPI()
-    mount(app, *world)
-    with serve(app) as origin, browser_at(origin) as client:
-        login(client, world[1])
-        yield client
-
-
 def card(client: httpx.Client, scene: str) -> str:
     return client.get(f"/dashboard/scenes/{scene}").text.partition('id="films"')[2].partition("</section>")[0]
 
 
-def test_the_button_of_a_scene_asks_for_a_film_and_the_page_plays_it(
-    client: httpx.Client, world: tuple[Settings, Database, Stores]
-) -> None:
-    _, database, stores = world
+def test_the_button_of_a_scene_asks_for_a_film_and_the_page_plays_it(dashboard: Served) -> None:
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     scene = register(tiny_scene(), database, stores.artifacts)
     assert "Nothing has been filmed yet" in card(client, scene)
     assert f'name="id" value="{scene}"' in card(client, scene)
-    own = {"origin": str(client.base_url).rstrip("/")}
+    own = from_page(client)
     asked = client.post("/dashboard/start/video", data={"of": "scene", "id": scene}, headers=own)
     assert asked.status_code == 303
     assert "follow its job" in card(client, scene) and "<video" not in card(client, scene)
-    with database.session() as session:
-        (waiting,) = leases.publishable(session)
-        lease = leases.claim(session, waiting.shard_id, "test", 60.0)
-        made = stores.artifacts.put_bytes(FILM, "film.mp4", "video/mp4").model_dump()
-        assert lease is not None
-        assert leases.complete(session, lease, {"report": REPORT, "artifacts": [made]}, made["sha256"])
+    made = stores.artifacts.put_bytes(FILM, "film.mp4", "video/mp4").model_dump()
+    work(database, lambda lease: {"report": REPORT, "artifacts": [made]})
     with database.reading() as session:
         (film,) = videos.list_videos(session).data
     shown = card(client, scene)
@@ -109,20 +76,15 @@ def test_the_button_of_a_scene_asks_for_a_film_and_the_page_plays_it(
     assert client.get(address).status_code == 404
 
 
-def test_a_film_with_its_recording_has_a_switch_and_both_files(
-    client: httpx.Client, world: tuple[Settings, Database, Stores]
-) -> None:
-    _, database, stores = world
+def test_a_film_with_its_recording_has_a_switch_and_both_files(dashboard: Served) -> None:
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     scene = register(tiny_scene(), database, stores.artifacts)
-    own = {"origin": str(client.base_url).rstrip("/")}
+    own = from_page(client)
     client.post("/dashboard/start/video", data={"of": "scene", "id": scene}, headers=own)
-    with database.session() as session:
-        (waiting,) = leases.publishable(session)
-        lease = leases.claim(session, waiting.shard_id, "test", 60.0)
-        put = stores.artifacts.put_bytes
-        made = [put(FILM, "film.mp4", "video/mp4"), put(FILM[::-1], "recording.mp4", "video/mp4")]
-        found = {"report": REPORT, "artifacts": [item.model_dump() for item in made]}
-        assert lease is not None and leases.complete(session, lease, found, made[0].sha256)
+    put = stores.artifacts.put_bytes
+    made = [put(FILM, "film.mp4", "video/mp4"), put(FILM[::-1], "recording.mp4", "video/mp4")]
+    found = {"report": REPORT, "artifacts": [item.model_dump() for item in made]}
+    work(database, lambda lease: found)
     with database.reading() as session:
         (film,) = videos.list_videos(session).data
     shown = card(client, scene)

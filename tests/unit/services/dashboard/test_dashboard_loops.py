@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from fastapi import FastAPI
-from serving import serve
-from test_dashboard_access import browser_at, login
+from dashboard_served import Served, demonstrated, from_page, work
 from tiny_scene import register, tiny_scene
 
 from physworld_schemas.dataset import DatasetConfig
@@ -18,11 +14,9 @@ from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
 from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import TrainingCreate
-from physworld_services.dashboard import mount
 from physworld_services.stores import Stores
-from physworld_storage.database import Database, open_database
+from physworld_storage.database import Database
 from physworld_storage.jobs import jobs, leases
-from physworld_storage.settings import Settings
 
 pytestmark = pytest.mark.slow
 
@@ -53,14 +47,8 @@ class World:
         with self.database.session() as session:
             return jobs.create_loop(session, LoopCreate(model="bar", version=1, scene_id=self.recording))
 
-    def work(self, shards: int = 100) -> None:
-        for _ in range(shards):
-            with self.database.session() as session:
-                waiting = leases.publishable(session)
-                if not waiting:
-                    return
-                lease = leases.claim(session, waiting[0].shard_id, "test", 60.0)
-                assert lease is not None and leases.complete(session, lease, self._result(lease))
+    def work(self, most: int | None = None) -> None:
+        work(self.database, self._result, most)
 
     def _result(self, lease: leases.Lease) -> dict[str, Any]:
         answer = {
@@ -73,12 +61,8 @@ class World:
             answer["compared"] = {**other, "gain_m": 3.55e-3, "gain_ci95_m": [3e-3, 4e-3]}
         files = [TWIN] if self.verdict == "named" else []
         return {
+            **demonstrated(lease),
             "fit": {"parameters": {}, "metrics": {}, "artifacts": [TWIN]},
-            "dataset_plan": {"episodes": 1, "frames": 4, "particles": 5},
-            "episode": {
-                "index": 0, "path": lease.shard_id, "digest": "a" * 64, "seed": 0, "frames": 4, "particles": 5,
-            },
-            "dataset_seal": {"digest": "b" * 64, "artifacts": []},
             "training": {"artifacts": [], "sha256": "c" * 64, "metrics": {}},
             "trace": {
                 "verdict": self.verdict, "report": {"reason": "so", "effects": [EFFECT]}, "artifacts": files,
@@ -88,17 +72,8 @@ class World:
 
 
 @pytest.fixture
-def shown(tmp_path: Path) -> Iterator[tuple[World, httpx.Client]]:
-    settings = Settings(data_dir=tmp_path)
-    database = open_database(settings)
-    database.upgrade()
-    stores = Stores(settings)
-    app = FastAPI()
-    mount(app, settings, database, stores)
-    with serve(app) as origin, browser_at(origin) as client:
-        login(client, database)
-        yield World(database, stores), client
-    database.dispose()
+def shown(dashboard: Served) -> tuple[World, httpx.Client]:
+    return World(dashboard.database, dashboard.stores), dashboard.client
 
 
 def test_the_page_of_a_model_shows_the_chain_of_versions_with_their_errors(
@@ -147,7 +122,7 @@ def test_a_loop_is_started_from_a_form_and_again_with_other_settings(
     shown: tuple[World, httpx.Client],
 ) -> None:
     world, client = shown
-    own = {"origin": str(client.base_url).rstrip("/")}
+    own = from_page(client)
     asked = {"model": "bar", "version": "1", "scene_id": world.recording, "trace.seed": "5"}
     answer = client.post("/dashboard/start/loop", data=asked, headers=own)
     assert answer.status_code == 303, answer.text

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from fastapi import FastAPI
+from dashboard_served import Served, demonstrated, work
 from PIL import Image
-from serving import serve
-from test_dashboard_access import browser_at, login
 from tiny_scene import register, tiny_scene
 
 from physworld.arrays import Array
@@ -24,11 +20,9 @@ from physworld.scene import Scene
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.model import TrainingCreate
-from physworld_services.dashboard import mount
 from physworld_services.stores import Stores
-from physworld_storage.database import Database, open_database
+from physworld_storage.database import Database
 from physworld_storage.jobs import jobs, leases
-from physworld_storage.settings import Settings
 
 pytestmark = pytest.mark.slow
 
@@ -52,13 +46,7 @@ class World:
 
     def work(self) -> None:
         """Do all that waits."""
-        while True:
-            with self.database.session() as session:
-                waiting = leases.publishable(session)
-                if not waiting:
-                    return
-                lease = leases.claim(session, waiting[0].shard_id, "test", 60.0)
-                assert lease is not None and leases.complete(session, lease, self._result(lease))
+        work(self.database, self._result)
 
     def train(self) -> None:
         """Publish the first version of ``bar``."""
@@ -75,28 +63,16 @@ class World:
         return [self.stores.artifacts.put_bytes(buffer.getvalue(), "prediction.npz").model_dump()]
 
     def _result(self, lease: leases.Lease) -> dict[str, Any]:
-        episode = {"index": 0, "path": lease.shard_id, "digest": "a" * 64, "seed": 0}
         return {
+            **demonstrated(lease),
             "fit": {"parameters": {}, "metrics": {}, "artifacts": self._prediction(DRIFT_M)},
-            "dataset_plan": {"episodes": 1, "frames": 4, "particles": 5},
-            "episode": {**episode, "frames": 4, "particles": 5},
-            "dataset_seal": {"digest": "b" * 64, "artifacts": []},
             "training": {"artifacts": self._prediction(2 * DRIFT_M), "sha256": "c" * 64, "metrics": {}},
         }[lease.kind]
 
 
 @pytest.fixture
-def shown(tmp_path: Path) -> Iterator[tuple[World, httpx.Client]]:
-    settings = Settings(data_dir=tmp_path)
-    database = open_database(settings)
-    database.upgrade()
-    stores = Stores(settings)
-    app = FastAPI()
-    mount(app, settings, database, stores)
-    with serve(app) as origin, browser_at(origin) as client:
-        login(client, database)
-        yield World(database, stores), client
-    database.dispose()
+def shown(dashboard: Served) -> tuple[World, httpx.Client]:
+    return World(dashboard.database, dashboard.stores), dashboard.client
 
 
 def pixels(answer: httpx.Response) -> Array:

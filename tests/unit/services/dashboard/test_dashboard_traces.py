@@ -6,28 +6,21 @@ import html
 import io
 import json
 import re
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from fastapi import FastAPI
-from serving import serve
+from dashboard_served import Served, from_page, work
 from sqlalchemy import select
-from test_dashboard_access import browser_at, login
 from tiny_scene import register, tiny_scene
 
 from physworld_schemas.base import Artifact, Problem
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TraceCreate
-from physworld_services.dashboard import mount
 from physworld_services.stores import Stores
-from physworld_storage.database import Database, open_database
 from physworld_storage.jobs import jobs, leases
-from physworld_storage.settings import Settings
 from physworld_storage.tables import AssessmentRow, ModelRow, ModelVersionRow, ShardRow, utc_now
 
 pytestmark = pytest.mark.slow
@@ -70,28 +63,8 @@ REPORT: dict[str, Any] = {
 
 
 @pytest.fixture
-def world(tmp_path: Path) -> Iterator[tuple[Settings, Database, Stores]]:
-    settings = Settings(data_dir=tmp_path)
-    database = open_database(settings)
-    database.upgrade()
-    yield settings, database, Stores(settings)
-    database.dispose()
-
-
-@pytest.fixture
-def client(world: tuple[Settings, Database, Stores]) -> Iterator[httpx.Client]:
-    app = FastAPI()
-    mount(app, *world)
-    with serve(app) as origin, browser_at(origin) as client:
-        login(client, world[1])
-        yield client
-
-
-def _complete(database: Database, result: dict[str, Any]) -> None:
-    with database.session() as session:
-        (waiting, *_) = leases.publishable(session)
-        lease = leases.claim(session, waiting.shard_id, "test", 60.0)
-        assert lease is not None and leases.complete(session, lease, result)
+def client(dashboard: Served) -> httpx.Client:
+    return dashboard.client
 
 
 def _files(stores: Stores) -> list[dict[str, Any]]:
@@ -105,13 +78,13 @@ def _files(stores: Stores) -> list[dict[str, Any]]:
 
 
 @pytest.fixture
-def trace_id(world: tuple[Settings, Database, Stores]) -> str:
+def trace_id(dashboard: Served) -> str:
     """A ready trace, and a pending one beside it."""
-    _, database, stores = world
+    database, stores = dashboard.database, dashboard.stores
     scene_id = register(tiny_scene(), database, stores.artifacts)
     with database.session() as session:
         job = jobs.create_trace(session, TraceCreate(scene_id=scene_id))
-    _complete(database, {"verdict": "named", "report": REPORT, "artifacts": _files(stores)})
+    work(database, lambda lease: {"verdict": "named", "report": REPORT, "artifacts": _files(stores)})
     with database.session() as session:
         jobs.create_trace(session, TraceCreate(scene_id=scene_id))
     return job.outputs[0].id
@@ -157,10 +130,8 @@ def test_the_report_runs_in_a_cage_and_everything_else_under_the_usual_policy(
     assert "unsafe-inline" not in usual and "script-src 'self'" in usual
 
 
-def test_what_is_not_there_yet_is_said(
-    client: httpx.Client, world: tuple[Settings, Database, Stores], trace_id: str
-) -> None:
-    _, database, _ = world
+def test_what_is_not_there_yet_is_said(dashboard: Served, trace_id: str) -> None:
+    database, client = dashboard.database, dashboard.client
     with database.reading() as session:
         pending = jobs.list_jobs(session, kind="trace", state="queued").data[0].outputs[0].id
     page = client.get(f"/dashboard/traces/{pending}")
@@ -170,10 +141,8 @@ def test_what_is_not_there_yet_is_said(
     assert client.get("/dashboard/traces/trc_none").status_code == 404
 
 
-def test_a_failed_job_has_a_button_that_retries_it(
-    client: httpx.Client, world: tuple[Settings, Database, Stores]
-) -> None:
-    _, database, stores = world
+def test_a_failed_job_has_a_button_that_retries_it(dashboard: Served) -> None:
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     with database.session() as session:
         job = jobs.create_fit(session, register(tiny_scene(), database, stores.artifacts), FitConfig())
     page = f"/dashboard/jobs/{job.id}"
@@ -184,16 +153,14 @@ def test_a_failed_job_has_a_button_that_retries_it(
             assert lease is not None
             leases.fail(session, lease, Problem(title="Boom", status=500, code="boom"), retry=False)
     assert f'action="{page}/retry"' in client.get(page).text
-    own = {"origin": str(client.base_url).rstrip("/")}
+    own = from_page(client)
     assert client.post(f"{page}/retry", headers=own).status_code == 303
     with database.reading() as session:
         assert jobs.get_job(session, job.id).state == "queued"
 
 
-def test_what_was_cancelled_is_not_shown_as_failed(
-    client: httpx.Client, world: tuple[Settings, Database, Stores]
-) -> None:
-    _, database, stores = world
+def test_what_was_cancelled_is_not_shown_as_failed(dashboard: Served) -> None:
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     scene_id = register(tiny_scene(), database, stores.artifacts)
     with database.session() as session:
         fit = jobs.create_fit(session, scene_id, FitConfig())
@@ -208,10 +175,8 @@ def test_what_was_cancelled_is_not_shown_as_failed(
     assert "The trace was cancelled" in page
 
 
-def test_a_pipeline_that_closes_the_loop_shows_the_stage(
-    client: httpx.Client, world: tuple[Settings, Database, Stores]
-) -> None:
-    _, database, stores = world
+def test_a_pipeline_that_closes_the_loop_shows_the_stage(dashboard: Served) -> None:
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     scene_id = register(tiny_scene(), database, stores.artifacts)
     with database.session() as session:
         plain = jobs.create_pipeline(session, PipelineCreate(scene_id=scene_id))
@@ -223,9 +188,9 @@ def test_a_pipeline_that_closes_the_loop_shows_the_stage(
 
 
 def test_the_page_of_an_assessment_says_how_much_and_where_it_is_traced(
-    client: httpx.Client, world: tuple[Settings, Database, Stores], trace_id: str
+    dashboard: Served, trace_id: str
 ) -> None:
-    _, database, stores = world
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     scene_id = register(tiny_scene(), database, stores.artifacts)
     figure = {"error_m": 9e-3, "ci95_m": [8e-3, 1e-2], "noise_floor_m": 1e-3, "frames": 40}
     with database.session() as session:
@@ -258,18 +223,14 @@ def test_the_page_of_an_assessment_says_how_much_and_where_it_is_traced(
     assert "The twin carries drag" in version and "gain 5.00 to 7.00" in version
 
 
-def test_artifacts_of_a_trace_are_files_to_download(
-    client: httpx.Client, world: tuple[Settings, Database, Stores], trace_id: str
-) -> None:
-    files = [Artifact.model_validate(item) for item in _files(world[2])]
-    page = client.get(f"/dashboard/traces/{trace_id}").text
+def test_artifacts_of_a_trace_are_files_to_download(dashboard: Served, trace_id: str) -> None:
+    files = [Artifact.model_validate(item) for item in _files(dashboard.stores)]
+    page = dashboard.client.get(f"/dashboard/traces/{trace_id}").text
     assert all(file.sha256 in page for file in files)
 
 
-def test_the_page_of_a_fit_says_what_the_engine_itself_does(
-    client: httpx.Client, world: tuple[Settings, Database, Stores]
-) -> None:
-    _, database, stores = world
+def test_the_page_of_a_fit_says_what_the_engine_itself_does(dashboard: Served) -> None:
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     scene_id = register(tiny_scene(), database, stores.artifacts)
     with database.session() as session:
         fit_id = jobs.create_fit(session, scene_id, FitConfig()).outputs[0].id
@@ -285,7 +246,7 @@ def test_the_page_of_a_fit_says_what_the_engine_itself_does(
         "search": {"converged": False, "open": {"E": "the search had not converged on it"}},
         "notes": ["a clamp of 4 markers"],
     }
-    _complete(database, {"parameters": {"E": modulus}, "metrics": metrics, "artifacts": []})
+    work(database, lambda lease: {"parameters": {"E": modulus}, "metrics": metrics, "artifacts": []}, most=1)
     page = client.get(f"/dashboard/fits/{fit_id}", follow_redirects=True).text
     for text in (
         "0.0612 1/s", "7.7 Hz", "0.420 mm", "6,750", "204,000", "not converged: E, the search", "a clamp of 4 markers",
@@ -294,9 +255,9 @@ def test_the_page_of_a_fit_says_what_the_engine_itself_does(
 
 
 def test_the_page_of_a_fit_that_its_budget_cut_short_gives_no_interval_and_says_why(
-    client: httpx.Client, world: tuple[Settings, Database, Stores]
+    dashboard: Served,
 ) -> None:
-    _, database, stores = world
+    database, stores, client = dashboard.database, dashboard.stores, dashboard.client
     scene_id = register(tiny_scene(), database, stores.artifacts)
     with database.session() as session:
         fit_id = jobs.create_fit(session, scene_id, FitConfig(max_simulations=40)).outputs[0].id
@@ -309,7 +270,7 @@ def test_the_page_of_a_fit_that_its_budget_cut_short_gives_no_interval_and_says_
         "search": {"converged": False, "open": {"E": note}},
         "notes": [],
     }
-    _complete(database, {"parameters": {"E": modulus}, "metrics": metrics, "artifacts": []})
+    work(database, lambda lease: {"parameters": {"E": modulus}, "metrics": metrics, "artifacts": []}, most=1)
     page = client.get(f"/dashboard/fits/{fit_id}", follow_redirects=True).text
     for text in (note, "not known", "not converged: E, the search was cut short", "there is no optimum"):
         assert text in page, text

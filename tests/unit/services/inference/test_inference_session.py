@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from published_tiny import tiny_model
+from published_tiny import DRAG, tiny_model
 
 from physworld.worldmodel.published import PublishedModel
 from physworld_services.inference.session import HEAD, SET_BACK, ControlRefused, LiveSession
@@ -72,6 +72,53 @@ def test_a_factor_changes_the_body_from_the_next_tick_on_as_it_changes_a_rollout
 def test_a_factor_that_cannot_be_meant_is_refused(factors: dict[str, Any], words: str) -> None:
     with pytest.raises(ControlRefused, match=words):
         LiveSession(tiny_model()[2]).set_factors(factors)
+
+
+def test_a_strength_that_the_training_varied_changes_the_body_within_its_range() -> None:
+    model = tiny_model(dragged=True)[2]
+    velocity = np.tile([0.0, 0.0, 0.3], (4, 1))
+    name = f"{DRAG.effect}.{DRAG.name}"
+
+    def points(strengths: dict[str, float] | None) -> np.ndarray:
+        session = LiveSession(model)
+        assert session.describe()["strengths"] == [
+            {"name": name, "label": "air drag linear: rate", "unit": "1/s", "value": 2.0}
+            | {"low": pytest.approx(DRAG.low), "high": pytest.approx(DRAG.high)}
+        ]
+        if strengths is not None:
+            session.set_strengths(strengths)
+            session.reset()
+        for _ in range(5):
+            session.tick(velocity)
+        return np.frombuffer(session.frame(1.0, 0), "<f4", offset=HEAD.size).reshape(-1, 3)
+
+    plain, dragged = points(None), points({name: 3.4})
+    assert points({name: 2.0}) == pytest.approx(plain, abs=1e-6)
+    assert np.abs(dragged - plain).max() > 2e-6
+    steps = model.start_controllers[-1] + model.spec.dt_s * np.arange(1, 6)[:, None, None] * velocity
+    driven = np.concatenate([model.start_controllers, steps])
+    expected = model.skin.apply(model.at_strengths({name: 3.4}).rollout(driven)[-1])
+    assert dragged[: len(expected)] == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("strengths", "words"),
+    [
+        ({f"{DRAG.effect}.{DRAG.name}": 4.0}, r"is 4; the demonstrations covered 0.5 to 3.5 1/s"),
+        ({f"{DRAG.effect}.{DRAG.name}": None}, "not a finite number"),
+        ({"wind.rate_per_s": 1.0}, "there are air_drag_linear.rate_per_s"),
+    ],
+)
+def test_a_strength_that_was_not_covered_is_refused(strengths: dict[str, Any], words: str) -> None:
+    with pytest.raises(ControlRefused, match=words):
+        LiveSession(tiny_model(dragged=True)[2]).set_strengths(strengths)
+
+
+def test_a_model_without_varied_strengths_offers_none() -> None:
+    session = LiveSession(tiny_model()[2])
+    assert session.describe()["strengths"] == []
+    with pytest.raises(ControlRefused, match="the demonstrations varied none"):
+        session.set_strengths({"wind.rate_per_s": 1.0})
 
 
 def test_a_frame_between_two_ticks_is_of_one_moment() -> None:

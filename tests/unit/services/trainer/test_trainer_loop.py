@@ -15,6 +15,7 @@ from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
 from physworld.estimation.noise import freeze
 from physworld.worldmodel.foreign import ForeignPrediction
+from physworld.worldmodel.published import PublishedModel
 from physworld_schemas.assessment import Assessment, AssessmentCreate
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
@@ -38,7 +39,7 @@ WEIGHTS = "model.safetensors"
 FRAMES = 48
 FIT = FitConfig(particle_budget=60, max_simulations=4)
 SMALL = TrainingConfig(
-    hidden=16, message_passing_steps=2, history=2, look_ahead=2, vertices=20, steps=16, batch_size=2,
+    hidden=16, message_passing_steps=2, history=2, look_ahead=2, vertices=20, steps=80, batch_size=2,
     fine_tune_steps=5,
     formats=[],
 )  # fmt: skip
@@ -140,6 +141,16 @@ def test_the_card_says_which_effect_and_the_errors_before_and_after(
     assert plain.metrics["fine_tuning"]["strengths"] == {}
     weights = load(runtime.stores.artifacts.read_bytes(named(version.artifacts, WEIGHTS, "bar").sha256))
     assert weights["norm.properties"].shape == (2,), "a published version takes no strengths"
+    told = card["architecture"]["strengths"]
+    assert [(one["name"], one["unit"], one["range"]) for one in told] == [
+        ("air_drag_linear.rate_per_s", "1/s", [1.5, 2.5])
+    ]
+    assert told[0]["value"] == pytest.approx(strength["tuned"], rel=1e-6)
+    model = PublishedModel.from_card(weights, card)
+    driven = np.repeat(model.start_controllers[-1:], 12, axis=0)
+    driven[: len(model.start_controllers)] = model.start_controllers
+    paths = [model.at_strengths({told[0]["name"]: rate}).rollout(driven) for rate in (1.5, 2.5)]
+    assert np.abs(paths[1] - paths[0]).max() > 0.0, "the strength does nothing"
     for name, row in (("twin", "twin"), ("world_model", "world_model_finetuned")):
         figures = section[name]
         assert figures["after_m"] == pytest.approx(version.metrics["held_out"]["track_m"][row])
