@@ -49,6 +49,9 @@ lint-imports:
 lint-security:
 	$(BIN)/bandit --quiet --recursive --configfile pyproject.toml physworld scenes schemas storage workers services clients/python
 
+# what the tests start, processes of the service above all, finds its modules compiled, whatever the shell says
+test test-fast: export PYTHONDONTWRITEBYTECODE :=
+
 test: lint
 	$(BIN)/python -m pytest --numprocesses=$(JOBS) --dist=loadfile --no-loadscope-reorder
 
