@@ -36,6 +36,7 @@ COPY services/__init__.py services/connections.py services/interpreter.py servic
 COPY services/api/ physworld_services/api/
 COPY services/dashboard/ physworld_services/dashboard/
 COPY services/guide/ physworld_services/guide/
+COPY clients/python/physworld_client/ physworld_client/
 USER 10001:10001
 EXPOSE 8000
 CMD ["python", "-m", "physworld_services.web", "--host", "0.0.0.0", "--port", "8000"]

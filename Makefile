@@ -19,7 +19,7 @@ export OMP_NUM_THREADS ?= 1
 SITE ?= services/guide/site
 MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --clean --site-dir $(SITE)
 
-.PHONY: demo test test-fast bench lint up clean install dev catalogue docs reference wheels sdk lock audit
+.PHONY: demo test test-fast bench lint lint-types lint-style lint-imports lint-security up clean install dev catalogue docs reference wheels sdk lock audit
 
 install:
 	@scripts/bootstrap.sh
@@ -34,17 +34,26 @@ up: install $(SITE)/index.html
 	@exec $(BIN)/physworld up --data "$(DATA)"
 
 lint: dev
+	@$(MAKE) --no-print-directory --jobs=2 lint-types lint-style lint-imports lint-security
+
+lint-types:
+	$(BIN)/mypy
+
+lint-style:
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+
+lint-imports:
 	$(BIN)/lint-imports
+
+lint-security:
 	$(BIN)/bandit --quiet --recursive --configfile pyproject.toml physworld scenes schemas storage workers services clients/python
 
 test: lint
-	$(BIN)/python -m pytest --numprocesses=$(JOBS) --dist=loadfile
+	$(BIN)/python -m pytest --numprocesses=$(JOBS) --dist=loadfile --no-loadscope-reorder
 
 test-fast: dev
-	$(BIN)/python -m pytest --numprocesses=$(JOBS) --dist=loadfile --durations=10 -m "not slow and not service and not browser"
+	$(BIN)/python -m pytest --numprocesses=$(JOBS) --dist=loadfile --no-loadscope-reorder --durations=10 -m "not slow and not service and not browser"
 
 bench:
 	@scripts/bootstrap.sh --bench

@@ -123,6 +123,8 @@ class Scene:
         times: seconds from the first frame, (T,) float64, strictly increasing, not always even.
         gravity_m_s2: (3,).
         noise_sigma_m: tracking noise per axis, or None.
+        controller_errors_m: what the controllers at the frames may err by, (E, T, K, 3): independent changes of all
+            of them, one standard deviation each; None: nothing.
         noise_covariance_m2: of every sighting of each point, in world axes, (N, 3, 3), or None: the same noise along
             every axis. The root of a third of its mean trace is ``noise_sigma_m``.
         train, test: half-open frame ranges.
@@ -155,6 +157,7 @@ class Scene:
     grips: tuple[Grip, ...] = ()
     colliders: tuple[DeclaredCollider, ...] = ()
     controller_velocities: Array | None = None
+    controller_errors_m: Array | None = None
     control_times: Array | None = None
     control_points: Array | None = None
     rest_volume_points: Array | None = None
@@ -197,6 +200,13 @@ class Scene:
         if known is not None:
             known = known * (sigma_m / sigma_of(known)) ** 2
         return replace(self, noise_sigma_m=sigma_m, noise_covariance_m2=known)
+
+    def mistaken_controls(self) -> list[Array]:
+        """Control points (T, K, 3) [m] at the frames, one standard deviation off by each of their errors; none where
+        controllers are given at a higher rate."""
+        if self.controller_errors_m is None or self.control_times is not None:
+            return []
+        return [self.controllers + error for error in self.controller_errors_m]
 
     def control_track(self) -> tuple[Array, Array]:
         """Times (Tc,) [s] and controller positions (Tc, K, 3) [m] at the best rate, none before the first frame."""

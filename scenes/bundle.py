@@ -58,6 +58,7 @@ FIELD_OF_ARRAY = {
     "controllers": "controllers",
     "times": "times",
     "controller_velocities": "controller_velocities",
+    "controller_errors": "controller_errors_m",
     "ctrl_times": "control_times",
     "ctrl_points": "control_points",
     "rest_volume_points": "rest_volume_points",

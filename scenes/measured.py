@@ -45,6 +45,7 @@ ARRAY_SHAPES = {
     "controllers": ("T", "K", 3),
     "times": ("T",),
     "controller_velocities": ("T", "K", 3),
+    "controller_errors": ("E", "T", "K", 3),
     "ctrl_times": ("C",),
     "ctrl_points": ("C", "K", 3),
     "rest_volume_points": ("M", 3),
@@ -53,7 +54,7 @@ ARRAY_SHAPES = {
 }
 REQUIRED = ("points", "visible", "controllers", "times")
 NEVER_EMPTY = ("rest_volume_points", "ctrl_times", "ctrl_points")
-PLACES = ("points", "controllers", "ctrl_points", "rest_volume_points", "surface_points")
+PLACES = ("points", "controllers", "controller_errors", "ctrl_points", "rest_volume_points", "surface_points")
 
 
 @dataclass

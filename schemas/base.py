@@ -25,6 +25,8 @@ from physworld_schemas.wording import meant
 ObjectKind = Literal[
     "scene", "check", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "video", "artifact"
 ]
+Tag = Annotated[str, Field(min_length=1, max_length=64)]
+"""A word or a few by which people find an object again."""
 Unmade = Literal["failed", "cancelled"]
 """States of an object that its job did not make."""
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")

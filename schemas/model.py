@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 from pydantic import Field, computed_field
 
-from physworld_schemas.base import UNIT_OF_METRIC, Artifact, Lineage, Request, Resource, Seed
+from physworld_schemas.base import UNIT_OF_METRIC, Artifact, Lineage, Request, Resource, Seed, Tag
 from physworld_schemas.quality import Quality, quality_of
 from physworld_schemas.standing import standing_of
 
 Format = Literal["torch_export", "onnx"]
 FORMATS: tuple[Format, ...] = get_args(Format)
-Tag = Annotated[str, Field(min_length=1, max_length=64)]
 
 
 class TrainingConfig(Request):

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from physworld_schemas.base import Artifact, Request, Resource
+from physworld_schemas.base import Artifact, Request, Resource, Tag
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Unit = Literal["m", "cm", "mm", "in", "ft"]
@@ -109,8 +109,18 @@ class ScenePreview(Resource):
     )
 
 
+class ScenePatch(Request):
+    """Body of PATCH /v1/scenes/{scene_id}: the one field that is no part of the recording."""
+
+    tags: list[Tag] = Field(
+        max_length=50,
+        description="Tags from now on, in the place of those before.",
+        examples=[["soft", "day 2"]],
+    )
+
+
 class Scene(Resource):
-    """A measured scene as stored: immutable, addressed by the digest of its canonical bundle.
+    """A measured scene as stored, addressed by the digest of its canonical bundle: immutable but for its tags.
 
     ``declared`` is its ``scene.json``; a list leaves it out (null), since it may be long.
     """

@@ -318,6 +318,8 @@ def _both_widths(page: Page, address: str, out: Path, name: str) -> int:
             curve.locator(".legend").wait_for()
         if page.locator("[data-playground]").count():
             page.wait_for_selector("[data-playground][data-ready][data-accompanied]")
+            page.get_by_label("Twin, live").check()
+            page.locator("[data-twin]", has_text="from the model").wait_for()
         page.wait_for_timeout(1e3 * DRAWN_S)
         for _ in range(2):  # what is as high as a share of the window grows with it
             height = min(TALLEST_PX, int(page.evaluate("document.documentElement.scrollHeight")))

@@ -15,10 +15,10 @@ from physworld_schemas.base import Artifact, Lineage, Page, Unmade
 from physworld_schemas.dataset import Dataset, Episode
 from physworld_schemas.fit import Fit, Parameter
 from physworld_schemas.ids import new_id
-from physworld_schemas.scene import Scene
+from physworld_schemas.scene import Scene, ScenePatch
 from physworld_storage.errors import Conflict, NotFound, ResultInvalid
 from physworld_storage.pages import page_of
-from physworld_storage.search import matching
+from physworld_storage.search import listing, matching
 from physworld_storage.tables import (
     DatasetRow,
     EpisodeRow,
@@ -117,12 +117,23 @@ def find_scene(session: Session, digest: str) -> Scene | None:
     return None if row is None else _scene(row)
 
 
+def patch_scene(session: Session, scene_id: str, patch: ScenePatch) -> Scene:
+    """Give a scene other tags, each once. Raises NotFound."""
+    row = session.get(SceneRow, scene_id, with_for_update=True)
+    if row is None:
+        raise NotFound("scene", scene_id)
+    row.tags = list(dict.fromkeys(patch.tags))
+    session.flush()
+    return get_scene(session, scene_id)
+
+
 def list_scenes(
     session: Session,
     *,
     limit: int = 50,
     cursor: str | None = None,
     kind: str | None = None,
+    tag: str | None = None,
     search: str | None = None,
 ) -> Page[Scene]:
     """Scenes, newest first, without their declared documents, which are not read either.
@@ -132,15 +143,18 @@ def list_scenes(
         limit: most scenes of a page, 1 to ``pages.MAX_LIMIT``.
         cursor: of the page before; None begins with the newest.
         kind: only objects of this kind.
-        search: words that an id, a name or a kind holds.
+        tag: only scenes that have this tag, in any case.
+        search: words that an id, a name, a kind or a tag holds.
 
     Raises:
         InvalidCursor: no list of scenes gave this cursor out.
     """
     statement = select(SceneRow).options(defer(SceneRow.declared, raiseload=True))
-    statement = matching(statement, search, SceneRow.id, SceneRow.name, SceneRow.kind)
+    statement = matching(statement, search, SceneRow.id, SceneRow.name, SceneRow.kind, SceneRow.tags)
     if kind is not None:
         statement = statement.where(SceneRow.kind == kind)
+    if tag is not None:
+        statement = statement.where(listing(SceneRow.tags, tag))
     keys = (SceneRow.created_at, SceneRow.id)
     return page_of(session, statement, keys, _listed_scene, limit=limit, cursor=cursor)
 

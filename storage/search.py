@@ -5,9 +5,10 @@ What is searched is what the lists show: identifiers, names, states. The name of
 
 from __future__ import annotations
 
+import json
 from typing import Any, TypeVar
 
-from sqlalchemy import ColumnElement, Select, String, cast, or_, select
+from sqlalchemy import JSON, ColumnElement, Select, String, cast, or_, select
 from sqlalchemy.orm import InstrumentedAttribute
 
 from physworld_storage.tables import DatasetRow, FitRow, JobRow, SceneRow
@@ -54,6 +55,12 @@ def matching_jobs(statement: Found, text: str | None) -> Found:
     return statement
 
 
+def listing(column: InstrumentedAttribute[Any], text: str) -> ColumnElement[bool]:
+    """Whether a column that lists texts has this one, in any case."""
+    return cast(column, String).icontains(json.dumps(text), autoescape=True)
+
+
 def _holds(column: InstrumentedAttribute[Any], word: str) -> ColumnElement[bool]:
     """Whether a text, or a column of JSON as text, holds a word."""
-    return cast(column, String).icontains(word, autoescape=True)
+    written = json.dumps(word)[1:-1] if isinstance(column.type, JSON) else word
+    return cast(column, String).icontains(written, autoescape=True)

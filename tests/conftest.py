@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -18,12 +19,27 @@ SERVICE_FOLDERS = ("contract/api", "contract/sdk", "recovery", "system")
 """Of the tests that start a service, or its processes."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs a service by the folder in which it lies."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what needs a service by the folder it lies in; where processes share the tests, long files come first."""
     folders = [REPOSITORY / "tests" / name for name in SERVICE_FOLDERS]
     for item in items:
         if any(item.path.is_relative_to(folder) for folder in folders):
             item.add_marker("service")
+    if hasattr(config, "workerinput"):
+        items[:] = _long_files_first(items)
+
+
+def _long_files_first(items: list[pytest.Item]) -> list[pytest.Item]:
+    """Files that wait for services and slow ones that compute, in turn; then quick ones, which fill up both ends."""
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    serving = [tests for tests in files.values() if tests[0].get_closest_marker("service")]
+    others = [tests for tests in files.values() if not tests[0].get_closest_marker("service")]
+    slow = [tests for tests in others if any(test.get_closest_marker("slow") for test in tests)]
+    quick = [tests for tests in others if not any(test.get_closest_marker("slow") for test in tests)]
+    in_turn = [tests for pair in zip_longest(serving, slow, fillvalue=[]) for tests in pair]
+    return [test for tests in (*in_turn, *quick) for test in tests]
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -75,6 +75,7 @@ def publish_tiny(
     name: str = NAME,
     kind: str = "beam",
     dragged: bool = False,
+    acting: tuple[str, dict[str, float]] | None = None,
     lacking: str | None = None,
     card: dict[str, Any] | None = None,
     changed: dict[str, Callable[[np.ndarray], np.ndarray]] | None = None,
@@ -82,10 +83,12 @@ def publish_tiny(
 ) -> tuple[str, int]:
     """Register scene, fit and model; the model's name and version.
 
-    ``kind``: of the thing; ``dragged``: as of ``tiny_model``; ``lacking``: a tensor that is left out, as in a version of
-    an older layout; ``card``: more of its card; ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all.
+    ``kind``: of the thing; ``dragged``: as of ``tiny_model``; ``acting``: an effect of the twin beside the model, with
+    its strengths; ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more of its
+    card; ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all.
     """
     scene, twin, model = tiny_model(kind, dragged)
+    twin = twin if acting is None else twin.with_effect(effect(acting[0], **acting[1]))
     scene_id = register(scene, database, artifacts)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **twin.to_arrays())

@@ -49,7 +49,9 @@ def coverage_pictures(coverage: Coverage) -> tuple[bytes, bytes]:
         places = np.concatenate(coverage.places)
         _occupancy(axes[1, 1], places, 0, 2)
         _occupancy(axes[1, 2], places, 0, 1)
-        return _saved(figure, "svg", metadata={"Date": None}), _saved(figure, "png", dpi=DPI)
+        drawing = _saved(figure, "svg", metadata={"Date": None})
+        figure.set_layout_engine(None)  # all is in its place by now
+        return drawing, _saved(figure, "png", dpi=DPI)
 
 
 def _saved(figure: Figure, kind: str, **options: Any) -> bytes:

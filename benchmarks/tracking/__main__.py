@@ -1,5 +1,5 @@
 """``python -m benchmarks.tracking render NAME FOLDER [--cameras N]`` and ``... measure FOLDER... [--json FILE]``,
-and ``... splat FOLDER...`` and ``... tail [--picture PNG] [--over PNG]``."""
+``... whole FOLDER... [--trace]``, ``... splat FOLDER...`` and ``... tail [--picture PNG] [--over PNG]``."""
 
 from __future__ import annotations
 
@@ -30,6 +30,13 @@ def main() -> None:
     splat.add_argument("--most", type=int, default=None, help="Gaussians")
     splat.add_argument("--whole", action="store_true", help="the whole picture instead of the object")
     splat.add_argument("--json", type=Path, default=None, help="write the figures to this file")
+    whole = commands.add_parser("whole", help="import, fit and compare with a fit of exact tracks")
+    whole.add_argument("folders", type=Path, nargs="+")
+    whole.add_argument("--particles", type=int, default=1000)
+    whole.add_argument(
+        "--trace", action="store_true", help="trace the imported scenes instead of fitting them"
+    )
+    whole.add_argument("--json", type=Path, default=None, help="write the figures to this file")
     tail = commands.add_parser("tail", help="follow a real film, fetched as part of a package")
     tail.add_argument("--points", type=int, default=80)
     tail.add_argument("--picture", type=Path, default=None, help="PNG of what was followed")
@@ -46,6 +53,9 @@ def main() -> None:
         return
     if given.command == "splat":
         _splat(given)
+        return
+    if given.command == "whole":
+        _whole(given)
         return
     from benchmarks.tracking.measure import scene_of, score, table
     from physworld_scenes.bundle import write_bundle
@@ -80,6 +90,19 @@ def _tail(given: argparse.Namespace) -> None:
             tail.draw(frames, scene, followed, path, over)
     if given.json is not None:
         given.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+def _whole(given: argparse.Namespace) -> None:
+    from benchmarks.tracking.whole import named, table, whole_way
+
+    figures = []
+    for folder in given.folders:
+        figures.append((named if given.trace else whole_way)(folder, given.particles))
+        print(json.dumps(figures[-1]), flush=True)
+        if given.json is not None:
+            given.json.write_text(json.dumps(figures, indent=1) + "\n")
+    if not given.trace:
+        print(table(figures))
 
 
 def _splat(given: argparse.Namespace) -> None:

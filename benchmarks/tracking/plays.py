@@ -1,6 +1,7 @@
 """What the cameras look at: a beam, a rope and a cloth of known material, moved by engines that are not ours.
 
-The beam is MuJoCo's flex of ``scripts/make_sample_scene.py``, the rope the chain of
+The beam is MuJoCo's flex of ``scripts/make_sample_scene.py``, the bar the same of finite elements whose modulus is
+that of the material (``benchmarks.peers.finite_elements``), in a vacuum or in air, the rope the chain of
 ``scripts/make_sample_rope.py``, the cloth MuJoCo's flex of ``benchmarks.peers.flex_cloths``. A gripper of boxes
 holds them, covers what it holds, and carries an ArUco marker; a stick goes by between object and camera in the
 second second.
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -21,6 +23,7 @@ from physworld.camera import Camera, look_at
 from scripts import make_sample_rope, make_sample_scene
 
 FPS, FRAMES = 30.0, 90
+CONVERGED_PA, BAR_ELEMENTS, BAR_DRAG_PER_S = 2.85e5, (8, 2, 2), 1.0
 MARKER_SIDE_M = 0.05
 """Of the marker itself; the plate that it is printed on is a fifth wider on every side."""
 MARKER_ID = 7
@@ -77,7 +80,38 @@ def beam(frames: int = FRAMES) -> Play:
     recipe = make_sample_scene.Recipe()
     mesh = make_sample_scene.build_mesh(recipe)
     positions, _ = make_sample_scene.simulate(recipe, mesh, frames)
-    triangles = boundary(mesh.tetrahedra)
+    truth = {
+        "youngs_modulus_pa": CONVERGED_PA,
+        "note": "the coarse mesh, of 2.5e5 Pa, bends as a converged one of this",
+    }
+    return _held_beam(Surface(boundary(mesh.tetrahedra), mesh.vertices), positions, truth)
+
+
+def bar(frames: int = FRAMES, drag_per_s: float = 0.0) -> Play:
+    """The same body and motion, of quadratic elements, perhaps in air that nobody declares: a = -c v."""
+    from benchmarks.peers.finite_elements import Acting, Elements, record
+
+    recipe = make_sample_scene.Recipe()
+    low, size = np.array(recipe.corner_m), recipe.size_m
+    elements = Elements(
+        BAR_ELEMENTS, lambda unit: low + unit * size, CONVERGED_PA, recipe.poisson, recipe.density_kg_m3
+    )
+    held = np.flatnonzero(elements.nodes[:, 0] <= low[0] + recipe.grip_m + 1e-9)
+    path = record(
+        elements,
+        Acting(linear_drag_per_s=drag_per_s),
+        [(held, make_sample_scene.grip_pose)],
+        np.arange(frames) / FPS,
+    )
+    mesh = make_sample_scene.build_mesh(recipe)
+    nodes, weights = elements.weights(np.clip((mesh.vertices - low) / size, 1e-6, 1.0 - 1e-6))
+    positions = np.einsum("pk,tpki->tpi", weights, path[:, nodes])
+    truth = {"youngs_modulus_pa": CONVERGED_PA, "air_drag_per_s": drag_per_s}
+    return _held_beam(Surface(boundary(mesh.tetrahedra), mesh.vertices), positions, truth)
+
+
+def _held_beam(surface: Surface, positions: Array, truth: dict[str, Any]) -> Play:
+    recipe = make_sample_scene.Recipe()
     low, size = np.array(recipe.corner_m), recipe.size_m
     centre = low + 0.5 * np.array([recipe.grip_m, size[1], size[2]])
     jaws = [
@@ -98,13 +132,8 @@ def beam(frames: int = FRAMES) -> Play:
             "region_max_m": (low + np.array((recipe.grip_m, size[1], size[2]))).tolist(),
         },
     }
-    truth = {
-        "youngs_modulus_pa": recipe.young_pa,
-        "converged_modulus_pa": 2.85e5,
-        "note": "the coarse mesh bends as a converged one of 2.85e5 Pa",
-    }
     return _play(
-        "beam", Surface(triangles, mesh.vertices), positions, jaws, plate, make_sample_scene.grip_pose,
+        "beam", surface, positions, jaws, plate, make_sample_scene.grip_pose,
         centre, declared, truth, target=(0.1, 0.0, 0.5), distance=0.62, table_m=0.25,
     )  # fmt: skip
 
@@ -186,7 +215,13 @@ def cloth(frames: int = FRAMES) -> Play:
     )  # fmt: skip
 
 
-PLAYS = {"beam": beam, "rope": rope, "cloth": cloth}
+PLAYS = {
+    "beam": beam,
+    "bar": bar,
+    "bar_in_air": partial(bar, drag_per_s=BAR_DRAG_PER_S),
+    "rope": rope,
+    "cloth": cloth,
+}
 
 
 def _play(

@@ -11,6 +11,7 @@ runs along a row of pixels at the next ray, up to half a ray's distance away, al
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -66,6 +67,8 @@ class Stage:
         self._grain = wp.array([surface.grain_m for surface in surfaces], dtype=wp.float32)
         self._marker = wp.array(np.full((1, 1), 255) if marker is None else marker, dtype=wp.uint8)
         self._table_m = table_m
+        self._own = [slice(*ends) for ends in pairwise(starts)]
+        self._bare: tuple[Camera, tuple[Array, Array, Array]] | None = None
 
     def show(self, vertices: Array, camera: Camera, seed: int = 0) -> tuple[Array, Array, Array]:
         """Colour (H, W, 3) uint8, depth along the axis (H, W) float32 [m], and the surface seen (H, W), -1 for none.
@@ -75,10 +78,34 @@ class Stage:
             camera: from where.
             seed: of the shifts of the rays.
         """
+        found = [part.copy() for part in self._table(camera)]
+        for own in self._own:
+            pixels, distance = camera.project(vertices[own])
+            low, high = np.zeros(2, dtype=int), np.array([camera.width, camera.height])
+            if (distance > 0.0).all():
+                low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - 1, low, high)
+                high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + 1, low, high)
+            if (high > low).all():
+                box = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+                for whole, part in zip(found, self._cast_box(vertices, camera, seed, box), strict=True):
+                    whole[box[1] : box[3], box[0] : box[2]] = part
+        return found[0], found[1], found[2]
+
+    def _table(self, camera: Camera) -> tuple[Array, Array, Array]:
+        """What the camera sees where none of the surfaces is: it does not move, nor does the table."""
+        if self._bare is None or self._bare[0] is not camera:
+            nowhere = np.tile([0.0, 0.0, self._table_m - FAR_M], (len(self._rest), 1))
+            whole = (0, 0, camera.width, camera.height)
+            self._bare = (camera, self._cast_box(nowhere, camera, 0, whole))
+        return self._bare[1]
+
+    def _cast_box(
+        self, vertices: Array, camera: Camera, seed: int, box: tuple[int, int, int, int]
+    ) -> tuple[Array, Array, Array]:
+        """Colour, depth and surface of the pixels from left and top to before right and bottom."""
         mesh = wp.Mesh(points=wp.array(vertices, dtype=wp.vec3), indices=self._triangles)
-        pose = camera.world_to_camera
-        turn = wp.mat33(*pose[:3, :3].T.ravel().tolist())
-        size = (camera.height, camera.width)
+        turn = wp.mat33(*camera.world_to_camera[:3, :3].T.ravel().tolist())
+        size = (box[3] - box[1], box[2] - box[0])
         colour = wp.zeros(size, dtype=wp.vec3)
         depth = wp.zeros(size, dtype=wp.float32)
         seen = wp.zeros(size, dtype=wp.int32)
@@ -96,14 +123,13 @@ class Stage:
                 self._marker,
                 turn,
                 wp.vec3(*camera.centre.tolist()),
-                wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+                wp.vec4(camera.fx, camera.fy, camera.cx - box[0], camera.cy - box[1]),
                 self._table_m,
                 seed,
             ],
             outputs=[colour, depth, seen],
         )
-        pixels = np.clip(colour.numpy() * 255.0, 0.0, 255.0)
-        return pixels, depth.numpy(), seen.numpy()
+        return np.clip(colour.numpy() * 255.0, 0.0, 255.0), depth.numpy(), seen.numpy()
 
 
 @wp.func

@@ -10,6 +10,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.calibrate.parameters import Parameter
 from physworld.estimation.least_squares import Solution, block_covariance, correlations, interval_factor
+from physworld.estimation.uncertain import moved_by
 from physworld.evaluate.metrics import chamfer_l2
 from physworld.scene import Scene
 from physworld.twin.twin import Twin
@@ -47,7 +48,12 @@ class Correlations:
 
 
 def estimates(
-    parameters: list[Parameter], solution: Solution, frames: Array, points: Array, measured: bool
+    parameters: list[Parameter],
+    solution: Solution,
+    frames: Array,
+    points: Array,
+    measured: bool,
+    changes: list[Array] | None = None,
 ) -> tuple[dict[str, Estimate], Correlations]:
     """Estimates and correlations of the searched parameters.
 
@@ -56,8 +62,9 @@ def estimates(
         solution: the optimum with its sensitivities.
         frames, points: frame and tracked point of every residual, (m,).
         measured: the sensitivities were measured; without them no interval is given.
+        changes: of the residual (m,), one standard deviation each, by what errs for the whole recording.
     """
-    covariance = block_covariance(solution, frames, points)
+    covariance = block_covariance(solution, frames, points) + moved_by(solution.jacobian, changes or [])
     factor = interval_factor(len(np.unique(frames)), len(parameters)) if measured else float("inf")
     due = np.abs(np.linalg.lstsq(solution.jacobian, -solution.residual, rcond=None)[0])
     found = {}

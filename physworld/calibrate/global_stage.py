@@ -190,7 +190,7 @@ def calibrate(
     search.limit = config.max_simulations
     kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)
     twin = at(search.twin, kept, optimum.theta)
-    found, correlated = _estimates(search, kept, optimum, solution)
+    found, correlated = _estimates(search, kept, optimum, solution, search.mistaken(kept, optimum))
     if search.cut_short:
         found = cut_short(found, config.max_simulations)
     held = held_at_priors(scene, twin, rejected, parameters)
@@ -383,7 +383,11 @@ def _half_width(parameter: Parameter, estimate: Estimate) -> float:
 
 
 def _estimates(
-    search: Search, kept: list[Parameter], optimum: Optimum, solution: Solution | None
+    search: Search,
+    kept: list[Parameter],
+    optimum: Optimum,
+    solution: Solution | None,
+    changes: list[Array] | None = None,
 ) -> tuple[dict[str, Estimate], Correlations]:
     frames, points = search.frame_of_residual(search.end), search.point_of_residual()
     if solution is None:
@@ -391,4 +395,4 @@ def _estimates(
             optimum.theta, optimum.cost, np.zeros(len(frames)), np.zeros((len(frames), len(kept)))
         )
         return estimates(kept, empty, frames, points, measured=False)
-    return estimates(kept, solution, frames, points, measured=True)
+    return estimates(kept, solution, frames, points, True, changes)

@@ -32,6 +32,7 @@ from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import Descent as LeastSquares
 from physworld.estimation.least_squares import Solution, descent, differences, most_runs, probes_of
 from physworld.estimation.simulations import Drive, Job, Runner, in_turn
+from physworld.estimation.uncertain import mistaken_drives
 from physworld.estimation.unknowns import at, bounds_of
 from physworld.scene import UNDEFORMED_AT_REST, Scene
 from physworld.twin.twin import Twin
@@ -329,6 +330,25 @@ class Search:
         limit = _OFFSET_CLIP_SIGMAS * sigma
         offsets: list[list[float]] = np.clip(local.sum(axis=0) / seen, -limit, limit).tolist()
         return offsets
+
+    def mistaken(self, parameters: list[Parameter], optimum: Optimum) -> list[Array]:
+        """Changes of the residual (m,) [m] by what the scene's controllers may err by, one standard deviation each."""
+        drives = mistaken_drives(self.scene)
+        if not drives or not self._reaches(len(drives) + 1):
+            return []
+
+        def measure() -> dict[str, Any]:
+            job = self.job((parameters, optimum.theta, None))
+            before, _ = self.compared(job, next(self.run([job])))
+            changes = []
+            for drive in drives:
+                tracks = next(self.runner([job], drive, self._poll))
+                changes.append((self.compared(job, tracks)[0] - before).tolist())
+            self.simulations += len(drives) + 1
+            return {"changes": changes}
+
+        found = [np.array(change) for change in self.step("controllers", measure)["changes"]]
+        return [change for change in found if np.isfinite(change).all()]
 
     def step(self, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """A journalled step; the runs, whether any were left out, and their history are brought to where they were."""

@@ -11,7 +11,8 @@ from physworld.check.discrepancy import Discrepancy, discrepancy_of
 from physworld.errors import SimulationError
 from physworld.estimation.noise import Split, freeze, noise_sigma
 from physworld.estimation.simulations import Job, Simulations, nodes_of
-from physworld.estimation.whitening import Whitener, responses, turned_starts, whitener
+from physworld.estimation.uncertain import doubtful
+from physworld.estimation.whitening import Whitener, responses, whitener
 from physworld.scene import Scene
 from physworld.twin.twin import Twin
 
@@ -69,8 +70,7 @@ def recorded(
             "no noise is declared and none can be estimated from so few sightings; give it in metres per axis"
         )
     white = whitener(scene, split, sigma, responses(twin, nodes))
-    turned = simulations.run([Job(start, frames) for start in turned_starts(scene, twin, sigma)])
-    white = white.knowing([one - tracks for one in turned if one is not None])
+    white = white.knowing(doubtful(simulations, scene, twin, tracks, sigma))
     places = np.nan_to_num(scene.points[0])
     owners = np.zeros(len(places), dtype=int)
     discrepancy = discrepancy_of(white, split, scene.times, places, owners, tracks)

@@ -26,8 +26,9 @@ from physworld.errors import SceneUnsupported
 from physworld.estimation.faults import Faults, without_faults
 from physworld.estimation.noise import noise_sigma
 from physworld.estimation.simulations import Job, Memory, Progress, Runner, in_turn, stage_s
+from physworld.estimation.uncertain import doubtful
 from physworld.estimation.unknowns import Unknown
-from physworld.estimation.whitening import Whitener, turned_starts, whitener
+from physworld.estimation.whitening import Whitener, whitener
 from physworld.experiments import Experiment, propose, rival_of
 from physworld.scene import Scene
 from physworld.trace.answer import DATA as FAULTY
@@ -243,7 +244,7 @@ class _Trace:
         )
         numerics = {n: float(np.sqrt(np.mean(bare.change(d) ** 2))) for n, d in directions.items()}
         doubt = [_RICHARDSON[n] * d for n, d in directions.items() if n in _RICHARDSON]
-        also = [*self._turns(tracks, scale), *doubt]
+        also = [*self._doubtful(tracks, scale), *doubt]
 
         def whitening(answers: Array) -> Whitener:
             return whitener(self.scene, self.split, scale, answers).knowing(also)
@@ -344,12 +345,11 @@ class _Trace:
         seen = self.scene.visible[: self.frames]
         return float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames])[seen] ** 2)))
 
-    def _turns(self, tracks: Array, sigma: float) -> list[Array]:
-        """What the uncertain pose of the start does to the prediction, (frames, N, 3) each."""
+    def _doubtful(self, tracks: Array, sigma: float) -> list[Array]:
+        """What an uncertain start and controllers that err do to the prediction, (frames, N, 3) each."""
         if len(self.recordings.fitted) > 1:
             return []
-        jobs = [Job(turned, self.frames) for turned in turned_starts(self.lead, self.twin, sigma)]
-        return [found - tracks for found in self.simulations.run(jobs) if found is not None]
+        return doubtful(self.simulations, self.lead, self.twin, tracks, sigma)
 
 
 def _supported(known: list[Hypothesis], weights: Array, sigma: float) -> tuple[Supported, ...]:

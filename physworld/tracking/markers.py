@@ -49,8 +49,8 @@ class Sighted:
     @property
     def seen(self) -> Array:
         """(T,) bool."""
-        known: Array = np.isfinite(self.pixels).all(axis=(1, 2)) & np.isfinite(self.planes).all(axis=1)
-        return known
+        known = np.isfinite(self.pixels).all(axis=(1, 2)) & np.isfinite(self.planes).all(axis=1)
+        return np.asarray(known)
 
     def places(self, view: View) -> Array:
         """The points in space [m], (T, 4, 3), nan where not seen."""
@@ -80,7 +80,7 @@ def sighted(views: list[View], identity: int | None = None, dictionary: str = "4
     for _ in range(ROUNDS):
         total, count = np.zeros((FLAT_PX + 2 * MARGIN_PX,) * 2, np.float32), 0
         for view, quad in zip(views, quads, strict=True):
-            for frame in np.flatnonzero(np.isfinite(quad).all(axis=(1, 2))):
+            for frame in _shown(quad):
                 matrix, flat = _flat(view, frame, quad[frame])
                 if template is not None:
                     quad[frame] = _aligned(template, flat, matrix)
@@ -91,7 +91,7 @@ def sighted(views: list[View], identity: int | None = None, dictionary: str = "4
     found = []
     for view, quad in zip(views, quads, strict=True):
         planes = np.full((view.frames, 3), np.nan)
-        for frame in np.flatnonzero(np.isfinite(quad).all(axis=(1, 2))):
+        for frame in _shown(quad):
             planes[frame] = _plane(view, frame, quad[frame])
         found.append(Sighted(from_opencv(quad), planes))
     if not any(one.seen.any() for one in found):
@@ -134,6 +134,11 @@ def _greys(view: View) -> Iterator[tuple[int, Array]]:
         yield frame, cv2.cvtColor(np.ascontiguousarray(view.colour(frame)), cv2.COLOR_RGB2GRAY)
 
 
+def _shown(quad: Array) -> list[int]:
+    """Frames in which corners (T, 4, 2) are known."""
+    return [int(frame) for frame in np.flatnonzero(np.isfinite(quad).all(axis=(1, 2)))]
+
+
 def _corners() -> Array:
     """Of the marker in the flat picture, (4, 2), clockwise from the upper left."""
     return MARGIN_PX + FLAT_PX * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -142,7 +147,7 @@ def _corners() -> Array:
 def _flat(view: View, frame: int, quad: Array) -> tuple[Array, Array]:
     """The homography from the flat picture to the camera's, (3, 3), and the flat picture, float32."""
     matrix = cv2.getPerspectiveTransform(_corners().astype(np.float32), quad.astype(np.float32))
-    grey = cv2.cvtColor(np.ascontiguousarray(view.colour(int(frame))), cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(np.ascontiguousarray(view.colour(frame)), cv2.COLOR_RGB2GRAY)
     side = FLAT_PX + 2 * MARGIN_PX
     flat = cv2.warpPerspective(
         grey.astype(np.float32), matrix, (side, side), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
@@ -171,12 +176,13 @@ def _aligned(template: Array, flat: Array, matrix: Array) -> Array:
 
 def _plane(view: View, frame: int, quad: Array) -> Array:
     """Of ``Sighted.planes``, (3,)."""
-    depth, camera, middle = view.depth(int(frame)), view.camera, quad.mean(axis=0)
+    depth, camera, middle = view.depth(frame), view.camera, quad.mean(axis=0)
 
     def within(size: float) -> tuple[Array, Array]:
         inside = np.zeros(depth.shape, dtype=np.uint8)
         cv2.fillConvexPoly(inside, np.round(middle + size * (quad - middle)).astype(np.int32), 1)
-        return np.nonzero(inside)
+        rows, columns = np.nonzero(inside)
+        return rows, columns
 
     inner = within(0.85)
     plane = plane_in(depth, camera, *inner)

@@ -21,8 +21,9 @@ from physworld.tracking.rigid import RigidPath, joined, rigid_path, shifts_of, w
 from physworld.tracking.smoothing import white_deviation
 from physworld.tracking.view import View
 
-LEAST_PIXEL, LEAST_PLANE = 5e-3, 1e-6
-"""Of a deviation [px], [1/m]: nothing is known better, a board's plane neither."""
+LEAST_PIXEL, LEAST_PLANE = 0.03, 1e-6
+"""Of a deviation [px], [1/m]: interpolated pictures are fitted onto one another with errors of that size that change as
+slowly as the view does, which differences over time do not show; and no plane is known better."""
 _ROUNDS, _STEPS = 3, 4
 _RADIANS, _METRES = 1e-5, 1e-6  # steps of the finite differences
 _HELD = 1e-6  # of the four points, which a turn of all poses moves as well
@@ -121,7 +122,9 @@ def _poses(told: list[_Told], rough: RigidPath, known: Array) -> tuple[Array, Ar
             poses = poses - np.linalg.solve(normal, side[..., None])[..., 0]
         if number < _ROUNDS - 1:
             shape = _shape(told, poses, shape)
-    covariances = np.linalg.inv(normal)
+    left = sum(float(np.sum(one.misses(poses, shape) ** 2)) for one in told)
+    freedom = 11 * sum(int(one.seen.sum()) for one in told) - 6 * int(known.sum()) - shape.size
+    covariances = np.linalg.inv(normal) * max(left / freedom, 1.0)
     covariances[~known] = np.nan
     off = np.concatenate([one.misses(poses, shape)[one.seen, :8].ravel() * one.deviations[0] for one in told])
     nearest = min(float(np.median(1.0 / one.sights.planes[one.seen, 0])) / one.view.camera.fx for one in told)

@@ -2,7 +2,7 @@
 
 What is measured of a path is noisy, and a body that is held follows its noise: a few milliradians at the grip are a
 millimetre at the end of a beam, and jumps from frame to frame shake it. So the path is smoothed as stiffly as its own
-noise asks for (:mod:`physworld.tracking.smoothing`), and what stays uncertain goes with it as draws. Where a gripper is
+noise asks for (:mod:`physworld.tracking.smoothing`), and what stays uncertain goes with it. Where a gripper is
 not seen, its path goes on as it went, and the scene says how often.
 """
 
@@ -17,7 +17,7 @@ from physworld.arrays import Array
 from physworld.errors import TrackingFailed
 from physworld.tracking.smoothing import smoothed, white_deviation
 
-DRAWS, SEED = 16, 7
+DRAWS, SEED, MODES = 256, 7, 16
 LEAST_DEVIATION = 1e-7
 """[rad] and [m]: of a path that is drawn by a program."""
 
@@ -47,13 +47,32 @@ class RigidPath:
         """Points (K, 3) [m] of the first frame at every frame, (T, K, 3)."""
         return _carried(self.turns, self.places, points)
 
-    def carry_draws(self, points: Array) -> Array:
-        """The same by every draw, (S, T, K, 3): all begin where the points are."""
-        found = []
-        for turns, places in ((draw[:, :3], draw[:, 3:]) for draw in self.draws):
-            there = _carried(turns, places, points)
-            found.append(there + points - there[0])
-        return np.array(found).reshape(-1, len(self.places), *points.shape)
+    def errors(self, points: Array, body: Array) -> Array:
+        """What the path may err by, as changes of carried points (K, 3): (M, T, K, 3) [m], M = 0 where it is not known.
+
+        They are independent and one standard deviation each, those that move the body most first; none at the first
+        frame, where the points are.
+
+        Args:
+            points: of the first frame [m].
+            body: places of what is held, in the first frame [m], (S, 3).
+        """
+        if not len(self.draws):
+            return np.zeros((0, len(self.places), len(points), 3))
+        low, high = body.min(axis=0), body.max(axis=0)
+        corners = np.array(
+            [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+        )
+        both = np.concatenate([corners, points])
+        usual, found = _carried(self.turns, self.places, both), []
+        for draw in self.draws:
+            there = _carried(draw[:, :3], draw[:, 3:], both)
+            found.append(there - there[0] + both - usual)
+        changes = np.array(found) / len(found) ** 0.5
+        way = changes[:, :, : len(corners)].reshape(len(changes), -1)
+        modes = np.linalg.eigh(way @ way.T)[1][:, ::-1][:, :MODES]
+        kept: Array = np.einsum("sm,stki->mtki", modes, changes[:, :, len(corners) :])
+        return kept
 
 
 def rigid_path(points: Array) -> RigidPath:

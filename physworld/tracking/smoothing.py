@@ -22,7 +22,6 @@ _MEDIAN_OF_NORMAL = 0.6745
 _FIFTH = 252.0  # sum of squares of 1, -5, 10, -10, 5, -1
 _FEWEST = 10  # differences that tell a deviation
 _STIFFNESS = (-30.0, 10.0)  # logarithm of the chance in a frame over the noise, squared
-_APART = 6.0  # deviations from the smoothed path: a measurement that is wrong
 _DIFFUSE = 1e9
 _STEP = np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
 _CHANCE = np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])
@@ -36,13 +35,11 @@ class Smoothed:
         values: (T, C).
         deviations: of them, (T, C).
         draws: as likely paths, (S, T, C).
-        used: frames that counted, (T,) bool.
     """
 
     values: Array
     deviations: Array
     draws: Array
-    used: Array
 
 
 def white_deviation(values: Array, seen: Array) -> Array | None:
@@ -73,20 +70,9 @@ def smoothed(values: Array, deviations: Array, seen: Array, draws: int, rng: np.
         draws: S.
         rng: of the draws.
     """
-    used = seen.copy()
-    for _ in range(2):
-        channels = [_Channel(values[:, k], deviations[:, k], used) for k in range(values.shape[1])]
-        means, spreads = (
-            np.stack(part, axis=1) for part in zip(*(c.smooth() for c in channels), strict=True)
-        )
-        with np.errstate(invalid="ignore"):
-            miss = np.abs(values - means) / np.hypot(deviations, spreads)
-        wrong = used & (miss > _APART).any(axis=1)
-        if not wrong.any() or (used & ~wrong).sum() < 3:
-            break
-        used &= ~wrong
-    alike = np.stack([channel.draws(draws, rng) for channel in channels], axis=2)
-    return Smoothed(means, spreads, alike, used)
+    channels = [_Channel(values[:, k], deviations[:, k], seen) for k in range(values.shape[1])]
+    means, spreads = (np.stack(part, axis=1) for part in zip(*(c.smooth() for c in channels), strict=True))
+    return Smoothed(means, spreads, np.stack([channel.draws(draws, rng) for channel in channels], axis=2))
 
 
 class _Channel:

@@ -79,7 +79,7 @@ class LiveTwin:
         run = twin.integration(times, still, times, properties=properties)
         solver = twin.solver(run.problem)
         _refuse_terms(run, solver.terms)
-        self._held = held_paths(self._gripped, run.knots, still) if before is None else before._held
+        self._held: HeldNodes = before._held if before else held_paths(self._gripped, run.knots, still)
         self._lengths = np.diff(run.knots)
         self._times, self._track = [float(run.knots[0])], [self.controllers]
         self._nodes = twin.carriers_start

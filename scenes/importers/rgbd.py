@@ -236,9 +236,10 @@ def _parts(
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """What ``scene.json`` and ``scene.npz`` hold."""
     points, visible = followed.points, followed.visible
-    controllers, grips = np.zeros((len(points), 0, 3)), None
+    controllers, grips, errors = np.zeros((len(points), 0, 3)), None, np.zeros((0, len(points), 0, 3))
     if path is not None and given.grip is not None:
         controllers, grips = gripper_controllers(recording.views[0], given.grip, path, followed, warnings)
+        errors = path.errors(controllers[0], followed.cloud)
     covariances = sighting_covariances(points, visible, followed.cameras, followed.views)
     if covariances is not None and options.noise_sigma_m is not None:
         covariances *= (options.noise_sigma_m / sigma_of(covariances)) ** 2
@@ -269,6 +270,7 @@ def _parts(
             },
             "gripper": None if path is None else {
                 "frames_seen": int(path.seen.sum()), "deviation_from_rigid_m": path.misfit_m,
+                "controllers_err_m": float(np.sqrt((errors**2).sum(axis=0).mean())) if len(errors) else None,
             },
             "noise": "given" if options.noise_sigma_m else "measured along and across the lines of sight",
         },
@@ -284,6 +286,8 @@ def _parts(
     }
     if covariances is not None:
         arrays["noise_covariance"] = covariances
+    if len(errors):
+        arrays["controller_errors"] = errors
     if path is not None and (missing := 1.0 - float(path.seen.mean())) > UNSEEN_WARNING:
         warnings.append(f"the gripper is not seen in {missing:.0%} of the frames, where it is interpolated")
     return declared, arrays

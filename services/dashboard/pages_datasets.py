@@ -6,11 +6,12 @@ import json
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Path, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from physworld_schemas.library import catalogue
-from physworld_services.api.routes.datasets import EpisodeIndex, episode_file
+from physworld_services.api.exports import FORMATS
+from physworld_services.api.routes.datasets import EpisodeIndex, episode_file, export_file
 from physworld_services.dashboard import live
 from physworld_services.dashboard.clouds import Cloud, Layer, thinned
 from physworld_services.dashboard.lineage import lineage_graph
@@ -28,6 +29,7 @@ SHOWN_REJECTIONS = 12
 PICTURE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 DONE_STATES = frozenset({"sealed", "failed", "cancelled"})
 
+ExportPath = Annotated[str, Path(pattern=f"^({'|'.join(FORMATS)})$")]
 Cursor = Annotated[str | None, Query(max_length=512)]
 
 
@@ -104,6 +106,10 @@ def router(site: Site) -> APIRouter:
     @routes.get("/datasets/{dataset_id}/episodes/{index}/npz")
     def npz(dataset_id: str, index: EpisodeIndex) -> Response:
         return episode_file(dataset_id, index, site.database, site.stores)
+
+    @routes.get("/datasets/{dataset_id}/export/{form}")
+    def exported(dataset_id: str, form: ExportPath) -> Response:
+        return export_file(dataset_id, form, None, site.database, site.stores)
 
     return routes
 

@@ -13,7 +13,7 @@ from physworld_services.dashboard.access import require_same_origin, require_wri
 from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
 from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
 from physworld_services.dashboard.site import BASE, Site
-from physworld_services.dashboard.version_body import KEPT, start_s, surface_of
+from physworld_services.dashboard.version_body import KEPT, splat_of, start_s, start_vertices, surface_of
 from physworld_storage import registry, resources
 from physworld_storage.access import tickets
 from physworld_storage.access.api_keys import ApiKey
@@ -42,6 +42,15 @@ def router(site: Site) -> APIRouter:
     def surface(name: str, number: str) -> Response:
         found = surface_of(site, _version(site, name, number))
         return JSONResponse(None if found is None else found.document(), headers=KEPT)
+
+    @routes.get("/splat")
+    def splat(name: str, number: str) -> Response:
+        version = _version(site, name, number)
+        found, vertices = splat_of(site, version), start_vertices(site, version)
+        if found is None or vertices is None:
+            return JSONResponse(None)
+        carried = np.round(vertices.astype(np.float64), 6).ravel().tolist()
+        return JSONResponse({"url": f"{BASE}/artifacts/{found}", "vertices": carried})
 
     @routes.get("/ghost")
     def ghost(name: str, number: str) -> Response:

@@ -13,7 +13,7 @@ from physworld.arrays import Array
 from physworld_schemas.model import ModelVersion
 from physworld_services.dashboard.pages_models import card_of
 from physworld_services.dashboard.site import Site
-from physworld_storage import resources
+from physworld_storage import resources, videos
 
 if TYPE_CHECKING:
     from physworld_services.dashboard.surfaces import Surface
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 KEPT = {"Cache-Control": "private, max-age=600"}
 """Headers of what belongs to a version, which never changes."""
-WEIGHTS, TWIN = "model.safetensors", "twin.npz"
+WEIGHTS, TWIN, SPLAT = "model.safetensors", "twin.npz", "splat.ply"
+MOST_FILMS = 50
+"""Of a scene, among which a fitted splat is looked for."""
 REST, PARTICLES, TIMES, HISTORY = "rest.vertices", "particle.index", "start.time", "start.history"
 
 
@@ -48,6 +50,26 @@ def start_s(site: Site, version: ModelVersion, ticks: int | None = None) -> floa
         return 0.0
     ticks = len(tensors[HISTORY]) - 1 if ticks is None else ticks
     return float(tensors[TIMES][0]) + ticks * float(dt_s)
+
+
+def start_vertices(site: Site, version: ModelVersion) -> Array | None:
+    """The graph's vertices where the recording begins [m], (n, 3); None where its weights cannot be read."""
+    history = _tensors(site, version).get(HISTORY)
+    return None if history is None else history[0]
+
+
+def splat_of(site: Site, version: ModelVersion) -> str | None:
+    """Digest of the body's splat in the recording's first frame; None without one.
+
+    It is what was put beside the scene, else that of the newest film that fitted one to the scene's pictures.
+    """
+    if version.scene_id is None:
+        return None
+    with site.database.reading() as session:
+        files = list(resources.get_scene(session, version.scene_id).artifacts)
+        for video in videos.list_videos(session, scene_id=version.scene_id, limit=MOST_FILMS).data:
+            files += video.artifacts
+    return next((item.sha256 for item in files if item.name == SPLAT), None)
 
 
 def _tensors(site: Site, version: ModelVersion) -> Mapping[str, Array]:

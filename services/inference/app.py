@@ -46,7 +46,7 @@ def create_app(settings: Settings, database: Database) -> Starlette:
     """The application on an opened database."""
     models = Models(database, ArtifactStore(settings, ANSWERING))
     service = _Service(database, models)
-    sessions = LiveSessions(database, models)
+    sessions = LiveSessions(database, models, device=settings.device)
 
     routes = [
         Route("/rollouts", service.rollout, methods=["POST"]),

@@ -6,6 +6,9 @@ sends binary control messages, and as JSON text ``{"type": "reset"}`` and ``{"ty
 properties of the body relative to the model's, beside which ``"strengths": {NAME: x}`` may stand, strengths of effects
 in their units. Velocities last ``HOLD_S``: a client that falls silent stops its grips.
 
+With ``{"type": "twin", "on": true}`` the calibrated twin is run beside the model, on the same grips
+(``physworld_services.inference.companion``): its frames bear the flag 2; texts of the type ``twin`` say how it does.
+
 The model is stepped in a thread, never on the event loop. A slow reader gets fewer frames, the newest each time:
 nothing queues up here, only in the connection's buffers. A session ends after ``IDLE_S`` without a message (4408), at
 a message that cannot be read (1007), when the client does not take a frame within ``SEND_S`` (4409); a process holds
@@ -17,8 +20,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,15 +31,19 @@ import structlog
 from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from physworld.arrays import Array
 from physworld.worldmodel.errors import VersionUnreadable
+from physworld.worldmodel.published import PublishedModel
 from physworld_schemas.live import close_reason
+from physworld_schemas.model import ModelVersion
+from physworld_services.inference.companion import Companion, TwinStopped
 from physworld_services.inference.models import Models
-from physworld_services.inference.session import Control, ControlRefused, LiveSession
+from physworld_services.inference.session import Control, ControlRefused, LiveSession, checked_strength
 from physworld_storage.access import tickets
 from physworld_storage.database import Database
 from physworld_storage.errors import StorageError
 
-MOST_SESSIONS, THREADS = 4, 2
+MOST_SESSIONS, MOST_TWINS, THREADS = 4, 2, 2
 IDLE_S, SEND_S, CLOSE_S, HOLD_S = 120.0, 10.0, 1.0, 0.3
 MOST_FRAMES = 4
 UNREADABLE, TRY_LATER, POLICY, IDLE, TOO_SLOW = 1007, 1013, 1008, 4408, 4409
@@ -50,14 +59,22 @@ class LiveSessions:
         models: versions that are loaded.
         idle_s: after which a session that nobody steers ends [s].
         most: sessions at a time.
+        device: of Warp, for twins.
     """
 
     def __init__(
-        self, database: Database, models: Models, *, idle_s: float = IDLE_S, most: int = MOST_SESSIONS
+        self,
+        database: Database,
+        models: Models,
+        *,
+        idle_s: float = IDLE_S,
+        most: int = MOST_SESSIONS,
+        device: str = "cpu",
     ) -> None:
         self._database, self._models = database, models
         self._idle_s, self._most, self._open = idle_s, most, 0
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="live")
+        self._device, self._twins = device, asyncio.Semaphore(MOST_TWINS)
 
     async def serve(self, socket: WebSocket) -> None:
         """Serve one connection until it ends."""
@@ -74,10 +91,11 @@ class LiveSessions:
             return
         self._open += 1
         try:
-            _, published = await run_in_threadpool(self._models.get, model, version)
+            found, published = await run_in_threadpool(self._models.get, model, version)
             vertices = query.get("part") == "vertices"
             session = await run_in_threadpool(LiveSession, published, vertices=vertices)
-            await _Connection(socket, session, self._pool, frames, self._idle_s).run()
+            twin = _Beside(published, lambda: self._twin_of(found), self._device, self._twins)
+            await _Connection(socket, session, twin, self._pool, frames, self._idle_s).run()
         except (StorageError, VersionUnreadable) as error:
             log.warning("live_session_refused", model=model, version=version, error=str(error))
             await socket.close(POLICY, close_reason(error.code, str(error)))
@@ -86,24 +104,54 @@ class LiveSessions:
         finally:
             self._open -= 1
 
+    def _twin_of(self, version: ModelVersion) -> bytes:
+        """The twin's npz. Raises TwinStopped."""
+        try:
+            return self._models.twin(version)
+        except StorageError as error:
+            raise TwinStopped(f"the twin of the version cannot be read: {error}") from error
+
     def _key_of(self, ticket: str, subject: str) -> object | None:
         with self._database.session() as session:
             return tickets.redeem(session, ticket, subject)
 
 
+@dataclass(frozen=True)
+class _Beside:
+    """What a twin beside a session is made of: its npz as ``read`` gives it, and a place among the process's twins."""
+
+    model: PublishedModel
+    read: Callable[[], bytes]
+    device: str
+    places: asyncio.Semaphore
+
+
 class _Connection:
-    """A session with its connection: one task reads, one steps, one sends the newest frame."""
+    """A session with its connection: one task reads, one steps, one sends the newest frames; one steps the twin."""
 
     def __init__(
-        self, socket: WebSocket, session: LiveSession, pool: ThreadPoolExecutor, frames: int, idle_s: float
+        self,
+        socket: WebSocket,
+        session: LiveSession,
+        beside: _Beside,
+        pool: ThreadPoolExecutor,
+        frames: int,
+        idle_s: float,
     ) -> None:
-        self._socket, self._session, self._pool = socket, session, pool
+        self._socket, self._session, self._beside, self._pool = socket, session, beside, pool
         self._frames, self._idle_s = frames, idle_s
         self._control: Control | None = None
         self._heard_at = self._steered_at = asyncio.get_running_loop().time()
         self._reset = False
         self._newest: bytes | None = None
+        self._newest_of_twin: bytes | None = None
+        self._texts: list[str] = []
         self._fresh = asyncio.Event()
+        self._factors: dict[str, Any] = {}
+        self._strengths: dict[str, Any] = {}
+        self._twin: Companion | None = None
+        self._twin_task: asyncio.Task[None] | None = None
+        self._only_of_twin: dict[str, dict[str, Any]] = {}
 
     async def run(self) -> None:
         """Until the client leaves, falls silent, sends nonsense or stops reading."""
@@ -113,6 +161,7 @@ class _Connection:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        await self._let_twin_go()
         code, reason = next(iter(done)).result()
         if code and self._socket.application_state is WebSocketState.CONNECTED:
             with suppress(
@@ -144,13 +193,74 @@ class _Connection:
                 return UNREADABLE, str(error)[:120]
 
     async def _told(self, message: dict[str, Any]) -> None:
-        if message.get("type") == "reset":
+        kind = message.get("type")
+        if kind == "reset":
             self._reset = True
-        elif message.get("type") == "factors":
+        elif kind == "factors":
             self._session.set_factors(dict(message["factors"]))
-            if "strengths" in message:  # the weights are prepared anew
-                set_strengths, strengths = self._session.set_strengths, dict(message["strengths"])
-                await asyncio.get_running_loop().run_in_executor(self._pool, set_strengths, strengths)
+            if "strengths" in message:
+                await self._set_strengths(dict(message["strengths"]))
+            self._factors = dict(message["factors"])
+            if self._twin is not None:
+                self._twin.change(self._factors, self._strengths)
+        elif kind == "twin":
+            await self._let_twin_go()
+            if message["on"] is True:
+                self._twin_task = asyncio.create_task(self._run_twin())
+
+    async def _set_strengths(self, strengths: dict[str, Any]) -> None:
+        """Give the model those that it was trained over; the twin takes them all."""
+        own = self._session.strengths
+        known = {name: told for name, told in self._only_of_twin.items() if name not in own}
+        for name, told in known.items():
+            if name in strengths:
+                checked_strength(name, strengths[name], told["low"], told["high"])
+        of_model = {name: value for name, value in strengths.items() if name not in known}
+        work = self._session.set_strengths  # the weights are prepared anew
+        await asyncio.get_running_loop().run_in_executor(self._pool, work, of_model)
+        self._strengths = strengths
+
+    async def _run_twin(self) -> None:
+        """The twin beside the model, until it is sent away."""
+        beside = self._beside
+        if beside.places.locked():
+            reason = f"the {MOST_TWINS} twins of the process are all taken"
+            self._say({"state": "refused", "reason": reason})
+            return
+        async with beside.places:
+            twin = Companion(
+                beside.read, beside.device, beside.model, self._say, self._show_twin, self._restart
+            )
+            if self._factors or self._strengths:
+                twin.change(self._factors, self._strengths)
+            self._twin = twin
+            await twin.run()
+        self._twin = None
+
+    async def _let_twin_go(self) -> None:
+        task, self._twin, self._twin_task = self._twin_task, None, None
+        if task is not None:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    def _lead_twin(self) -> None:
+        """Tell the twin where the session is: at its start where the prediction was set back."""
+        if self._twin is not None and self._session.tick_number == 0:
+            self._twin.reset()
+        elif self._twin is not None:
+            self._twin.follow(self._session.tick_number, self._session.controllers)
+
+    def _say(self, told: dict[str, Any]) -> None:
+        self._only_of_twin |= {one["name"]: one for one in told.get("strengths", ())}
+        self._texts.append(json.dumps({"type": "twin", **told}))
+        self._fresh.set()
+
+    def _show_twin(self, tick: int, vertices: Array, controllers: Array) -> None:
+        self._newest_of_twin = self._session.twin_frame(tick, vertices, controllers)
+        self._fresh.set()
+
+    def _restart(self) -> None:
+        self._reset = True
 
     async def _step(self) -> tuple[int, str]:
         loop = asyncio.get_running_loop()
@@ -165,7 +275,10 @@ class _Connection:
             if self._reset:
                 self._reset = False
                 self._session.reset()
+                if self._twin is not None:
+                    self._twin.reset()
             await loop.run_in_executor(self._pool, self._session.tick, velocity)
+            self._lead_twin()
             for part in range(1, self._frames + 1):
                 self._newest = self._session.frame(part / self._frames, control.number if control else 0)
                 self._fresh.set()
@@ -178,13 +291,16 @@ class _Connection:
         while True:
             await self._fresh.wait()
             self._fresh.clear()
-            frame, self._newest = self._newest, None
-            if frame is None:
-                continue
+            texts, self._texts = self._texts, []
+            frames = [frame for frame in (self._newest, self._newest_of_twin) if frame is not None]
+            self._newest = self._newest_of_twin = None
             try:
                 async with asyncio.timeout(SEND_S):  # wait_for may swallow the cancellation (cpython 86296)
-                    await self._socket.send_bytes(frame)
-                self._session.sent(frame)
+                    for text in texts:
+                        await self._socket.send_text(text)
+                    for frame in frames:
+                        await self._socket.send_bytes(frame)
+                        self._session.sent(frame)
             except TimeoutError:
                 return TOO_SLOW, f"a frame was not taken within {SEND_S:g} s"
             except (WebSocketDisconnect, RuntimeError):

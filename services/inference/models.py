@@ -11,8 +11,10 @@ from safetensors.numpy import load as load_tensors
 
 from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.published import PublishedModel
+from physworld_schemas.fit import Fit
 from physworld_schemas.model import ModelVersion
-from physworld_storage import registry
+from physworld_schemas.trace import Trace
+from physworld_storage import registry, resources, traces
 from physworld_storage.artifacts import ArtifactStore
 from physworld_storage.database import Database
 from physworld_storage.errors import Conflict, NotFound
@@ -47,6 +49,23 @@ class Models:
                     self._kept.popitem(last=False)
             self._kept.move_to_end(found.sha256)
         return found, model
+
+    def twin(self, version: ModelVersion) -> bytes:
+        """The npz of the twin that a version learned from: its trace's where that added an effect, else its fit's.
+
+        Raises NotFound where it is gone.
+        """
+        with self._database.reading() as session:
+            if version.fit_id is None:
+                raise NotFound("fit of model version", f"{version.name}:{version.version}")
+            owner: Fit | Trace = resources.get_fit(session, version.fit_id)
+            if version.trace_id is not None:
+                trace = traces.get_trace(session, version.trace_id)
+                owner = trace if traces.leaves_twin(trace) else owner
+        found = next((item.sha256 for item in owner.artifacts if item.name == "twin.npz"), None)
+        if found is None:
+            raise NotFound("artifact", f"twin.npz of {owner.id}")
+        return self._artifacts.read_bytes(found)
 
     def _load(self, version: ModelVersion) -> PublishedModel:
         files = {item.name: item.sha256 for item in version.artifacts}

@@ -1,7 +1,8 @@
 """One live session without its connection: limits on the controls, ticks, the frames that are sent.
 
 A frame is little-endian: uint32 tick, uint32 number of the last control message, float32 time [s], uint32 flags
-(1: the prediction had left the numbers and was set back), then float32 points (N, 3) and controllers (K, 3) [m].
+(1: the prediction had left the numbers and was set back; 2: the body is the twin's), then float32 points (N, 3) and
+controllers (K, 3) [m].
 A control message is uint32 its number, then float32 velocities [m/s], (G, 3) for the grips or (K, 3).
 """
 
@@ -23,7 +24,7 @@ from physworld.worldmodel.model.properties import PhiColumn
 from physworld.worldmodel.published import PublishedModel
 
 HEAD = struct.Struct("<IIfI")
-SET_BACK = 1
+SET_BACK, OF_TWIN = 1, 2
 SPEED_PER_SIZE, REACH_PER_SIZE = 4.0, 1.5
 """Largest speed [1/s] and distance of a grip from its start, in sizes of the body."""
 
@@ -39,6 +40,14 @@ def strength_told(model: PublishedModel, column: PhiColumn) -> dict[str, Any]:
     value = model.strengths.quantities[column.name]
     named = {"name": column.name, "label": label(column.name), "unit": column.unit}
     return {**named, "low": low, "high": high, "value": value}
+
+
+def checked_strength(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> None:
+    """Raises ControlRefused for a strength that is no finite number, or outside of its bounds."""
+    if not _is_number(value):
+        raise ControlRefused(f"the strength {name!r} is not a finite number")
+    if not low <= value <= high:
+        raise ControlRefused(f"{name} is {value:g}; it may be {low:g} to {high:g}")
 
 
 def _is_number(value: Any) -> bool:
@@ -132,8 +141,7 @@ class LiveSession:
         They hold from the next tick on, and after a reset. Raises ControlRefused.
         """
         for name, value in strengths.items():
-            if not _is_number(value):
-                raise ControlRefused(f"the strength {name!r} is not a finite number")
+            checked_strength(name, value)
         try:
             self._rollout.set_model(self._model.at_strengths(strengths))
         except ValueError as error:
@@ -165,6 +173,28 @@ class LiveSession:
         tick = self._rollout.tick
         head = HEAD.pack(tick, number, max(tick - 1 + share, 0.0) * self.dt_s, self._flags)
         return head + ((1.0 - share) * self._before + share * self._now).astype("<f4").tobytes()
+
+    @property
+    def strengths(self) -> list[str]:
+        """Names of the strengths that the model was trained over."""
+        return [column.name for column in self._strengths]
+
+    @property
+    def tick_number(self) -> int:
+        """Ticks since the start."""
+        return self._rollout.tick
+
+    @property
+    def controllers(self) -> Array:
+        """Control points now [m], (K, 3)."""
+        places: Array = self._rollout.controllers
+        return places
+
+    def twin_frame(self, tick: int, vertices: Array, controllers: Array) -> bytes:
+        """The frame of the twin at a tick: its vertices (n, 3) under control points (K, 3) [m]."""
+        points = vertices if self._skin is None else self._skin.apply(vertices.astype(np.float64))
+        head = HEAD.pack(tick, 0, tick * self.dt_s, OF_TWIN)
+        return head + np.concatenate([points, controllers]).astype("<f4").tobytes()
 
     def sent(self, frame: bytes) -> None:
         """The client has this frame, and knows what its flags say; frames that were left out told nobody."""

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import zipfile
+from pathlib import Path
+
 import pytest
 from dashboard_browser import Visit
 from dashboard_world import World
@@ -42,6 +46,38 @@ def test_every_list_is_searched_and_its_address_says_what_for(
     expect(visit.page.locator("main")).to_contain_text("fits")
     visit.page.get_by_role("link", name="Show all").first.click()
     expect(visit.page.locator(rows).first).to_be_visible()
+
+
+def test_a_scene_is_labelled_on_its_page_and_found_by_its_tags(visit: Visit, world: World) -> None:
+    visit.open(f"/scenes/{world.scene_id}")
+    visit.page.get_by_label("Tags, with commas between").fill("swinging, day 2")
+    visit.page.get_by_role("button", name="Keep", exact=True).click()
+    expect(visit.page.locator(".facts .badge.tag")).to_have_text(["swinging", "day 2"])
+    visit.open("/scenes")
+    box = visit.page.get_by_role("searchbox")
+    box.fill("swinging")
+    box.press("Enter")
+    expect(visit.page.locator("tbody tr")).to_have_count(1)
+    expect(visit.page.locator("tbody tr")).to_contain_text("day 2")
+    visit.page.get_by_role("link", name="day 2").click()
+    expect(visit.page.locator("tbody tr")).to_have_count(1)
+    visit.open(f"/scenes/{world.scene_id}")
+    visit.page.get_by_label("Tags, with commas between").fill("")
+    visit.page.get_by_role("button", name="Keep", exact=True).click()
+    expect(visit.page.locator(".facts .badge.tag")).to_have_count(0)
+
+
+def test_a_dataset_is_downloaded_for_lerobot_from_its_page(
+    visit: Visit, world: World, tmp_path: Path
+) -> None:
+    visit.open(f"/datasets/{world.dataset_id}")
+    with visit.page.expect_download() as download:
+        visit.page.get_by_role("link", name="LeRobot v3.0").click()
+    assert download.value.suggested_filename == f"{world.dataset_id}-lerobot.zip"
+    download.value.save_as(tmp_path / "kept.zip")
+    with zipfile.ZipFile(tmp_path / "kept.zip") as archive:
+        info = json.loads(archive.read(f"{world.dataset_id}/meta/info.json"))
+    assert (info["total_episodes"], info["total_frames"]) == (3, 120)
 
 
 def test_a_filter_of_states_keeps_the_words(visit: Visit) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import shutil
 import time
@@ -14,9 +15,12 @@ import numpy as np
 import pytest
 from dashboard_browser import FLAGS, WATCH_POLICY, Visit
 from inference_serving import Served, serve_inference
+from PIL import Image
 from playwright.sync_api import Page, expect, sync_playwright
-from published_tiny import DRAG, publish_tiny
+from published_tiny import DRAG, publish_tiny, tiny_model
 from test_dashboard_accessible import WIDTHS, violations
+
+from physworld.video.gaussians import gaussians_at_points, to_ply
 
 pytestmark = pytest.mark.browser
 
@@ -279,3 +283,75 @@ def test_what_is_recorded_comes_as_arrays_and_as_a_film(served: Served, page: Pa
     assert (np.diff(times) > 0).all()
     assert controllers[-1, 0, 0] - controllers[0, 0, 0] > 0.01
     assert (tmp_path / "kept.webm").read_bytes()[:4] == b"\x1aE\xdf\xa3"
+
+
+def test_the_twin_runs_live_beside_the_model_as_a_second_body(served: Served, page: Page) -> None:
+    enter(served, page)
+    page.get_by_label("Twin, live").check()
+    words = page.locator("[data-twin]")
+    expect(words).to_contain_text("its engine starts")
+    expect(words).to_contain_text("× real time")
+    until(page, lambda: int(page.get_attribute("[data-playground]", "data-twin-tick") or 0) > 20)
+    before = place(page, "grip")
+    page.focus("[data-playground] canvas")
+    page.keyboard.down("PageUp")
+    page.wait_for_timeout(1200)
+    page.keyboard.up("PageUp")
+    assert place(page, "grip")[2] - before[2] > 0.01
+    state = """() => { const { twin, surface } = window.playgrounds[0]; const mean = (array) => { let sum = 0;
+        for (let i = 2; i < array.length; i += 3) sum += 3 * array[i] / array.length; return sum; };
+        return { twin: mean(twin.body.attribute.array), model: mean(surface.attribute.array),
+        colours: [twin.body.mesh.material, surface.mesh.material].map((one) => one.color.getHexString()) }; }"""
+    raised = page.evaluate(state)
+    assert raised["colours"][0] != raised["colours"][1]
+
+    def followed() -> bool:  # the twin goes up with its grips, at its own pace where the machine is busy
+        now = page.evaluate(state)
+        return bool(abs(now["twin"] - now["model"]) < 0.02)
+
+    until(page, followed)
+    expect(words).to_contain_text("mm from the model (mean)")
+    assert float(page.get_attribute("[data-playground]", "data-twin-apart") or "nan") < 30.0
+    page.get_by_label("Twin, live").uncheck()
+    expect(words).to_have_text("")
+    assert page.evaluate("() => window.playgrounds[0].twin.body") is None
+
+
+def test_the_splat_of_the_scene_is_drawn_and_moves_with_the_model(served: Served, page: Page) -> None:
+    """Ellipses in the colours of the splat, in the place of the surface; the switch gives the surface back."""
+    model = tiny_model()[2]
+    points = np.repeat(model.start_history[0], 20, axis=0)
+    points += 0.003 * np.random.default_rng(0).standard_normal(points.shape)
+    content = to_ply(gaussians_at_points(points, np.tile([0.9, 0.1, 0.8], (len(points), 1))))
+    with served.client() as client:
+        scene_id = client.get(f"/v1/models/{served.model}/versions/{served.version}").json()["scene_id"]
+        files = {"bundle": ("splat.ply", content, "application/x-ply")}
+        assert client.post(f"/v1/scenes/{scene_id}/pictures/splat.ply", files=files).status_code == 200
+    enter(served, page)
+    expect(page.get_by_label("as its splat")).to_be_checked()
+    state = """() => { const { splat, surface, body } = window.playgrounds[0];
+        const { centre } = splat.geometry.attributes;
+        let mean = [0, 0, 0]; centre.array.forEach((value, i) => { mean[i % 3] += 3 * value / centre.array.length; });
+        return { mean, count: splat.count, tint: [...splat.geometry.attributes.tint.array.slice(0, 3)],
+        shown: [splat.mesh.visible, surface.mesh.visible, body.points.visible] }; }"""
+    shown = page.evaluate(state)
+    assert shown["shown"] == [True, False, False] and shown["count"] == len(points)
+    assert shown["tint"] == pytest.approx([0.9, 0.1, 0.8], abs=0.01)
+    until(page, lambda: bool(np.linalg.norm(page.evaluate(state)["mean"] - place(page, "centre")) < 0.01))
+    assert purple(page) > 1000
+    before = page.evaluate(state)["mean"]
+    page.focus("[data-playground] canvas")
+    page.keyboard.down("PageUp")
+    page.wait_for_timeout(1000)
+    page.keyboard.up("PageUp")
+    assert page.evaluate(state)["mean"][2] - before[2] > 5e-3
+    page.get_by_label("as its splat").uncheck()
+    assert page.evaluate(state)["shown"] == [False, True, False]
+    until(page, lambda: purple(page) < 150)  # the grips' own colour is near
+
+
+def purple(page: Page) -> int:
+    """Pixels of the view in the colour of the test's splat."""
+    picture = page.locator("[data-playground] canvas").screenshot()
+    colours = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
+    return int(((colours[..., 0] > 150) & (colours[..., 1] < 110) & (colours[..., 2] > 130)).sum())

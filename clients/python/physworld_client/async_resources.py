@@ -69,11 +69,22 @@ class AsyncScenes(AsyncListed):
         """One scene."""
         return await self._client.send(calls.scene_get(await self.id_of(scene_id)))
 
+    async def update(self, scene_id: str, *, tags: tuple[str, ...]) -> Scene:
+        """Gives a scene these tags, in the place of those before. The recording itself never changes."""
+        return await self._client.send(calls.scene_patch(await self.id_of(scene_id), tags))
+
     async def list(
-        self, *, limit: int | None = None, cursor: str | None = None, kind: str | None = None
+        self,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+        kind: str | None = None,
+        tag: str | None = None,
     ) -> AsyncListPage[Scene]:
-        """Scenes, newest first."""
-        return await self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind), cursor)
+        """Scenes, newest first: all, those of a kind, those that have a tag."""
+        return await self._page(
+            lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind, tag=tag), cursor
+        )
 
 
 class AsyncFits(AsyncListed):

@@ -39,7 +39,7 @@ from physworld_schemas.key import KeyCreate, KeyRotate, Role
 from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import AliasSet, TrainingConfig, TrainingCreate, VersionPatch
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_schemas.scene import SceneImport
+from physworld_schemas.scene import SceneImport, ScenePatch
 from physworld_schemas.trace import TraceConfig, TraceCreate
 
 Answer = TypeVar("Answer")
@@ -127,9 +127,16 @@ def scene_get(scene_id: str) -> Call[Scene]:
     return Call("GET", f"/v1/scenes/{_part(scene_id)}", _SCENE)
 
 
-def scene_list(*, limit: int | None, cursor: str | None, kind: str | None = None) -> Call[Page[Scene]]:
+def scene_patch(scene_id: str, tags: tuple[str, ...]) -> Call[Scene]:
+    """PATCH /v1/scenes/{id}."""
+    return Call("PATCH", f"/v1/scenes/{_part(scene_id)}", _SCENE, body=ScenePatch(tags=[*tags]))
+
+
+def scene_list(
+    *, limit: int | None, cursor: str | None, kind: str | None = None, tag: str | None = None
+) -> Call[Page[Scene]]:
     """GET /v1/scenes."""
-    return Call("GET", "/v1/scenes", _SCENES, query=_given(limit=limit, cursor=cursor, kind=kind))
+    return Call("GET", "/v1/scenes", _SCENES, query=_given(limit=limit, cursor=cursor, kind=kind, tag=tag))
 
 
 def fit_create(scene_id: str, config: FitConfig | None) -> Call[Job]:

@@ -70,11 +70,20 @@ class Scenes(Listed):
         """One scene."""
         return self._client.send(calls.scene_get(self.id_of(scene_id)))
 
+    def update(self, scene_id: str, *, tags: tuple[str, ...]) -> Scene:
+        """Gives a scene these tags, in the place of those before. The recording itself never changes."""
+        return self._client.send(calls.scene_patch(self.id_of(scene_id), tags))
+
     def list(
-        self, *, limit: int | None = None, cursor: str | None = None, kind: str | None = None
+        self,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+        kind: str | None = None,
+        tag: str | None = None,
     ) -> ListPage[Scene]:
-        """Scenes, newest first."""
-        return self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind), cursor)
+        """Scenes, newest first: all, those of a kind, those that have a tag."""
+        return self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind, tag=tag), cursor)
 
 
 class Fits(Listed):

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from physworld.arrays import Array
+from physworld.engine.captured import CHUNK, Chunk
 from physworld.engine.gradients.adjoint_kernels import (
     count_back,
     last_positions,
@@ -44,8 +46,6 @@ from physworld.engine.total.stress import BoundStress
 
 if TYPE_CHECKING:
     from physworld.engine.gradients.adjoint import RecordedRun
-
-_CHUNK = 8  # substeps in one captured graph: a divisor of every frame's
 
 
 @dataclass(frozen=True)
@@ -146,17 +146,14 @@ class ReversePass:
     def result(self) -> Gradient:
         """Go back over all frames, then over the half step of the start."""
         run, now, device = self._run, self._now, self._problem.device
-        graphs: dict[int, Any] = {}
+        chunks: dict[int, Chunk] = {}
         for frame in reversed(range(len(run.times) - 1)):
             self._enter(frame)
             stages = int(run.stages[frame])
-            if stages not in graphs:
-                with wp.ScopedCapture(device=device) as capture:
-                    for _ in range(_CHUNK):
-                        self._substep(stages)
-                graphs[stages] = capture.graph
-            for _ in range(int(run.substeps[frame]) // _CHUNK):
-                wp.capture_launch(graphs[stages])
+            if stages not in chunks:
+                chunks[stages] = Chunk(partial(self._substep, stages), device)
+            for _ in range(int(run.substeps[frame]) // CHUNK):
+                chunks[stages].launch()
         self._start()
         return self._collected(now)
 

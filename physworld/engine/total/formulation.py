@@ -16,12 +16,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import warp as wp
 
 from physworld.arrays import Array
+from physworld.engine.captured import CHUNK, Chunk
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.forces import InternalForces
 from physworld.engine.total.friction import FrictionForces
@@ -30,7 +31,6 @@ from physworld.engine.total.relaxation import MARGIN, Relaxation, stages_for
 from physworld.engine.total.stability import Steps, fastest_frequency
 from physworld.errors import BlewUp, CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
 
-_CHUNK = 8  # substeps in one captured graph
 _REACH = 1e3  # a node farther than this many body sizes from its start has left every workspace
 
 
@@ -213,7 +213,7 @@ class SteppedRun(ABC):
         forces.launch(self.x, self.clock, self.force)  # remembers the first strains: no friction acts yet
         self.v.assign(self._half_a_step_back(v, times[1] - times[0]).reshape(-1))
         self.force.zero_()
-        self._graphs: dict[int, Any] = {}
+        self._chunks: dict[int, Chunk] = {}
 
     @property
     def paths(self) -> tuple[wp.array, wp.array]:
@@ -233,15 +233,15 @@ class SteppedRun(ABC):
             ContactFailed: material came too deep into a collider.
         """
         substeps = self._set_clock(frame)
-        graph = self._graph(stages)
-        for _ in range(substeps // _CHUNK):
-            wp.capture_launch(graph)
+        chunk = self._chunk(stages)
+        for _ in range(substeps // CHUNK):
+            chunk.launch()
         self._stepped.substeps += substeps
         now: Array = self.x.numpy().reshape(-1, 3).copy()
         self._check(now, self._times[frame + 1])
         return now
 
-    def _graph(self, asked: int | None) -> Any:
+    def _chunk(self, asked: int | None) -> Chunk:
         """A chunk of substeps, captured once for every number of stages that friction takes."""
         stages, relaxation = 0, self._relaxation
         if relaxation is not None:
@@ -250,12 +250,9 @@ class SteppedRun(ABC):
             else:
                 relaxation.stages = asked
             stages = relaxation.stages
-        if stages not in self._graphs:
-            with wp.ScopedCapture(device=self._stepped.device) as capture:
-                for _ in range(_CHUNK):
-                    self._substep()
-            self._graphs[stages] = capture.graph
-        return self._graphs[stages]
+        if stages not in self._chunks:
+            self._chunks[stages] = Chunk(self._substep, self._stepped.device)
+        return self._chunks[stages]
 
     @property
     def stages(self) -> int:
@@ -376,8 +373,8 @@ class Run(SteppedRun):
 
 
 def whole_chunks(interval: float, time_step_s: float) -> int:
-    """Substeps of at most ``time_step_s`` that an interval [s] takes: whole chunks, the captured graph's length."""
-    return _CHUNK * max(1, int(np.ceil(interval / (time_step_s * _CHUNK))))
+    """Substeps of at most ``time_step_s`` that an interval [s] takes: whole chunks."""
+    return CHUNK * max(1, int(np.ceil(interval / (time_step_s * CHUNK))))
 
 
 def run_again_if_blown_up(

@@ -60,15 +60,13 @@ def fastest_frequencies(forces: NodalForces, rest: Array, mass: Array, spacing: 
         mass: lumped nodal masses [kg], (B, n).
         spacing: smallest cell size [m], the scale of the probe.
     """
-    clock = wp.zeros(3, dtype=wp.float64, device=forces.device)  # 1/dt = 0: friction silent
+    forces_at = _ForcesAt(forces, rest.size)
     scale = 1e-4 * spacing
     mode = np.repeat(np.random.default_rng(0).normal(size=rest.shape[1:])[None], len(rest), axis=0)
     squares = np.zeros(len(rest))
     for _ in range(_ITERATIONS):
         mode /= np.abs(mode).max(axis=(1, 2), keepdims=True)
-        pushed = _forces_at(forces, rest + scale * mode, clock) - _forces_at(
-            forces, rest - scale * mode, clock
-        )
+        pushed = forces_at(rest + scale * mode) - forces_at(rest - scale * mode)
         response = -pushed / (2 * scale) / mass[..., None]
         weighted = mass[..., None] * mode
         for body in range(len(rest)):
@@ -117,8 +115,30 @@ class Steps:
         return shrink > EXPLICIT_SHRINK or internal / self.explicit_s() > DRAG_SHRINK
 
 
-def _forces_at(forces: NodalForces, x: Array, clock: wp.array) -> Array:
-    force = wp.zeros(x.size, dtype=wp.float64, device=forces.device)
-    forces.launch(wp.array(x.reshape(-1), dtype=wp.float64, device=forces.device), clock, force)
-    forces_n: Array = force.numpy().reshape(x.shape)
-    return forces_n
+class _ForcesAt:
+    """Forces at positions, where they are asked for many times: one captured launch, between the same arrays.
+
+    Args:
+        forces: what is asked.
+        size: of the positions, 3n of all bodies.
+    """
+
+    def __init__(self, forces: NodalForces, size: int) -> None:
+        device = forces.device
+        clock = wp.zeros(3, dtype=wp.float64, device=device)  # 1/dt = 0: friction silent
+        self._x, self._force = (wp.zeros(size, dtype=wp.float64, device=device) for _ in range(2))
+        self._uploaded = self._x if self._x.device.is_cpu else wp.zeros(size, dtype=wp.float64, device="cpu")
+        self._written: Array = self._uploaded.numpy()  # the same memory
+        with wp.ScopedCapture(device=device) as capture:
+            forces.launch(self._x, clock, self._force)
+        self._launch, self._kept = capture.graph, clock
+
+    def __call__(self, x: Array) -> Array:
+        """Forces [N] at positions ``x`` (B, n, 3) [m]."""
+        self._written[:] = x.reshape(-1)
+        if self._uploaded is not self._x:
+            wp.copy(self._x, self._uploaded)
+        self._force.zero_()
+        wp.capture_launch(self._launch)
+        forces_n: Array = self._force.numpy().reshape(x.shape).copy()
+        return forces_n

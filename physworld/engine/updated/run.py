@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from physworld.arrays import Array
+from physworld.engine.captured import CHUNK, Chunk
 from physworld.engine.problem import HeldNodes
 from physworld.engine.total.node_kernels import advance_counter
 from physworld.engine.updated.contact import press_all
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from physworld.engine.updated.energy import ParticleMeter
     from physworld.engine.updated.formulation import UpdatedLagrangian
 
-_CHUNK = 8  # substeps in one captured graph
 _GROUP = 32  # particles that a thread takes in turn on a CPU: what a thread costs is shared
 _INSTANT = 1e-12  # [s], in which the first stress is found
 
@@ -76,7 +76,7 @@ class ParticleRun:
         self.flags = wp.zeros(4, dtype=wp.int32, device=device)
         self.extremes = wp.zeros(1, dtype=wp.float32, device=device)
         self.crossing = 0.0
-        self.graph = None
+        self.chunk: Chunk | None = None
         self.meter: ParticleMeter | None = None
         instant = wp.array([_INSTANT, 1.0 / _INSTANT, _INSTANT], dtype=wp.float64, device=device)
         stress.launch(particles.F, particles.C, particles.stress, instant, self.flags)
@@ -87,20 +87,21 @@ class ParticleRun:
         recorded = np.empty((frames, len(engine.solid), 3))
         recorded[0] = self._positions()
         engine.terms.begin(times, recorded[0])
-        self.graph = None  # the terms have new arrays
+        self.chunk = None  # the terms have new arrays
         if self.meter is not None:
             self.meter.frame()
         for frame in range(frames - 1):
             interval = float(times[frame + 1] - times[frame])
-            chunks = max(1, int(np.ceil(interval / (self._time_step(times[frame], interval) * _CHUNK))))
-            dt = interval / (chunks * _CHUNK)
+            chunks = max(1, int(np.ceil(interval / (self._time_step(times[frame], interval) * CHUNK))))
+            dt = interval / (chunks * CHUNK)
             self.clock.assign(np.array([interval, 1.0 / dt, dt]))
-            self.counter.assign(np.array([frame, 0, chunks * _CHUNK], dtype=np.int32))
+            self.counter.assign(np.array([frame, 0, chunks * CHUNK], dtype=np.int32))
             self._enclose(times[frame])
-            for chunk in range(chunks):
-                wp.capture_launch(self.graph)
-                engine.substeps += _CHUNK
-                self._check(times[frame] + (chunk + 1) * _CHUNK * dt, dt)
+            for number in range(chunks):
+                assert self.chunk is not None
+                self.chunk.launch()
+                engine.substeps += CHUNK
+                self._check(times[frame] + (number + 1) * CHUNK * dt, dt)
             recorded[frame + 1] = self._positions()
             if self.meter is not None:
                 self.meter.frame()
@@ -136,8 +137,8 @@ class ParticleRun:
         return step
 
     def _enclose(self, time: float) -> None:
-        rim = max(1, int(np.ceil(2 * _CHUNK * self.crossing)))
-        if self.box.enclose(self._positions(), rim, time) or self.graph is None:
+        rim = max(1, int(np.ceil(2 * CHUNK * self.crossing)))
+        if self.box.enclose(self._positions(), rim, time) or self.chunk is None:
             self._capture()
         self.flags.zero_()
 
@@ -162,7 +163,7 @@ class ParticleRun:
             )
         if flags[ESCAPED]:
             raise ParticlesLeftTheGrid(
-                f"a particle left the box of {tuple(self.box.counts.tolist())} nodes within {_CHUNK} substeps of "
+                f"a particle left the box of {tuple(self.box.counts.tolist())} nodes within {CHUNK} substeps of "
                 f"{dt:.3g} s before t = {time:.4f} s; the fastest crossed {crossing:.3g} cells a substep"
             )
         self.crossing = crossing
@@ -183,10 +184,7 @@ class ParticleRun:
         if self.meter is not None:
             self.meter.enclose(nodes)
         self.seen = nodal(any(contact.at_once for contact in self.engine.terms.contacts))
-        with wp.ScopedCapture(device=device) as capture:
-            for _ in range(_CHUNK):
-                self._substep()
-        self.graph = capture.graph
+        self.chunk = Chunk(self._substep, device)
 
     def _substep(self) -> None:
         engine, q, box = self.engine, self.particles, self.box.device_box

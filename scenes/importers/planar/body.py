@@ -78,7 +78,11 @@ def gripper_way(placed: Placed, small: View, factor: float, grip: GripFrom, time
         return gripper_path([placed.view], grip, times)
     way = gripper_path([small], grip, times)
     return replace(
-        way, places=way.places / factor, reference=way.reference / factor, misfit_m=way.misfit_m / factor
+        way,
+        places=way.places / factor,
+        reference=way.reference / factor,
+        misfit_m=way.misfit_m / factor,
+        draws=way.draws / np.repeat([1.0, factor], 3),
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
-from physworld.scene import Scene
+from physworld.scene import Scene, sigma_of
 from physworld.tracking.places import TrackConfig
 from physworld.tracking.plane import TRACKING_PIXEL_M, scaled, stretch
 from physworld.tracking.recording import Followed, Masks, follow_all
@@ -44,9 +44,11 @@ from physworld_scenes.importers.rgbd import (
 STRETCH_WARNING = 0.03
 LEAST_NOISE_PX = 0.05
 """Films repeat what hardly changes, so that places at rest differ by nothing; no patch is found better than this."""
+ACROSS_SHARE, ACROSS_MOST = 0.01, 500.0
+"""Across the plane: a hundredth of its distance from the camera, by which a body can leave it before lengths in the
+picture tell, and at most so many times the noise in the plane."""
 DESCRIPTION = (
-    "tracked in the pictures of one camera, on a declared plane; motion out of the plane is not seen, and the noise is "
-    "that in the plane"
+    "tracked in the pictures of one camera, on a declared plane; motion out of the plane is not seen"
 )
 
 
@@ -92,9 +94,10 @@ def read_planar(
         way = None if gripper is None else gripper_way(placed, small, factor, gripper, times)
     except TrackingFailed as error:
         raise refused(path.name, str(error)) from error
-    controllers, grips = np.zeros((len(times), 0, 3)), None
+    controllers, grips, errors = np.zeros((len(times), 0, 3)), None, np.zeros((0, len(times), 0, 3))
     if gripper is not None and way is not None:
         controllers, grips = controllers_of(placed, gripper, way, followed, behind, warnings)
+        errors = way.errors(controllers[0], followed.cloud)
     placed.facts["lengths"] = _lengths(followed, placed, warnings)
     declared = _declared(path, options, given, placed, followed, way, fps, behind)
     declared["grips"] = grips
@@ -106,6 +109,14 @@ def read_planar(
         "surface_points": followed.cloud,
         "colors": followed.colours,
     }
+    if len(errors):
+        arrays["controller_errors"] = errors
+    if (in_plane := declared["notes"]["noise_in_plane_m"]) is not None:
+        across = float(np.clip(ACROSS_SHARE * placed.distance_m, in_plane, ACROSS_MOST * in_plane))
+        arrays["noise_covariance"] = planar_covariances(
+            followed.points.shape[1], placed.axes, in_plane, across
+        )
+        declared["noise_sigma_m"] = sigma_of(arrays["noise_covariance"])
     filled = filling(kind, placed, mask, behind)
     if filled is not None:
         arrays["rest_volume_points"] = filled
@@ -181,7 +192,7 @@ def _declared(
         "description": DESCRIPTION,
         "fps": float(fps),
         "gravity_m_s2": list(options.gravity_m_s2),
-        "noise_sigma_m": noise,
+        "noise_sigma_m": None,
         "split": split_of(len(followed.points)),
         "initial_state": "undeformed and at rest at t=0; gravity acts from t=0" if given.undeformed else "as measured",
         "body": dict(options.body),
@@ -197,8 +208,21 @@ def _declared(
                 "frames_seen": int(way.seen.sum()), "deviation_from_rigid_m": way.misfit_m,
             },
             "noise": how,
+            "noise_in_plane_m": noise,
         },
     }  # fmt: skip
+
+
+def planar_covariances(count: int, axes: Array, in_plane_m: float, across_m: float) -> Array:
+    """Covariance of a sighting of every point, (N, 3, 3) [m^2]: hardly anything is known across the plane.
+
+    Args:
+        count: N.
+        axes: of the plane in the world: rows are x, y and z, which is towards the camera, (3, 3).
+        in_plane_m, across_m: deviations.
+    """
+    variances = np.array([in_plane_m, in_plane_m, across_m]) ** 2
+    return np.tile(axes.T @ np.diag(variances) @ axes, (count, 1, 1))
 
 
 def _noise(options: ImportOptions, placed: Placed, followed: Followed) -> tuple[float | None, str]:

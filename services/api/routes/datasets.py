@@ -8,12 +8,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 from fastapi import APIRouter, Path, Query, Response
+from fastapi.responses import StreamingResponse
 
 from physworld_schemas.base import Page
 from physworld_schemas.dataset import Dataset, DatasetCreate, Episode
 from physworld_schemas.job import Job
 from physworld_services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep, StoresDep
 from physworld_services.api.errors import documented
+from physworld_services.api.exports import FORMATS, export
 from physworld_services.api.idempotency import IdempotencyDep, accepted
 from physworld_services.stores import Stores
 from physworld_storage import resources
@@ -22,8 +24,26 @@ from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/datasets", tags=["datasets"])
 
-NPZ = "application/vnd.numpy.npz"
+NPZ, ZIP = "application/vnd.numpy.npz", "application/zip"
 
+ExportName = Annotated[
+    str,
+    Query(
+        description="Form, by its name in the catalogue's `exports`.",
+        pattern=f"^({'|'.join(FORMATS)})$",
+        examples=["lerobot"],
+    ),
+]
+MostPoints = Annotated[
+    int | None,
+    Query(
+        ge=1,
+        le=1_000_000,
+        description="At most so many particles, spread evenly over the body; empty: what the form takes by itself.",
+        json_schema_extra={"unit": "particles"},
+        examples=[256],
+    ),
+]
 EpisodeIndex = Annotated[int, Path(ge=0, lt=2**31, description="number of the episode in its dataset")]
 
 
@@ -62,6 +82,37 @@ def list_episodes(dataset_id: ObjectId, database: DatabaseDep, page: PageDep) ->
     """Committed episodes, by index."""
     with database.reading() as session:
         return resources.list_episodes(session, dataset_id, limit=page.limit, cursor=page.cursor)
+
+
+@router.get(
+    "/{dataset_id}/export",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "a ZIP of one folder, sent while it is written",
+            "content": {ZIP: {"schema": {"type": "string", "format": "binary"}}},
+        },
+        **documented(401, 403, 404, 409, 422, 503),
+    },
+)
+def export_dataset(
+    dataset_id: ObjectId,
+    database: DatabaseDep,
+    stores: StoresDep,
+    format: ExportName = "lerobot",
+    points: MostPoints = None,
+) -> Response:
+    """All episodes of a sealed dataset in a form that other tools read: LeRobot, PLY or npz."""
+    return export_file(dataset_id, format, points, database, stores)
+
+
+def export_file(
+    dataset_id: str, form: str, points: int | None, database: Database, stores: Stores
+) -> Response:
+    """A dataset as a file to keep. Raises what ``exports.export`` does."""
+    pieces = export(dataset_id, form, points, database, stores)
+    headers = {"Content-Disposition": f'attachment; filename="{dataset_id}-{form}.zip"'}
+    return StreamingResponse(pieces, headers=headers, media_type=ZIP)
 
 
 @router.get(

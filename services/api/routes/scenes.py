@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from sqlalchemy.orm import Session
 
 from physworld_schemas.base import Page
-from physworld_schemas.scene import Scene, ScenePreview
+from physworld_schemas.scene import Scene, ScenePatch, ScenePreview
 from physworld_services.api.dependencies import DatabaseDep, ObjectId, PageDep, SettingsDep, StoresDep
 from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import Idempotency, IdempotencyDep, answer_of
@@ -71,10 +71,11 @@ def list_scenes(
     database: DatabaseDep,
     page: PageDep,
     kind: Annotated[str | None, Query(max_length=32, pattern=r"^[a-z_]+$")] = None,
+    tag: Annotated[str | None, Query(min_length=1, max_length=64)] = None,
 ) -> Page[Scene]:
     """Scenes, newest first."""
     with database.reading() as session:
-        return resources.list_scenes(session, limit=page.limit, cursor=page.cursor, kind=kind)
+        return resources.list_scenes(session, limit=page.limit, cursor=page.cursor, kind=kind, tag=tag)
 
 
 @router.get("/{scene_id}", responses=documented(401, 403, 404, 422))
@@ -82,6 +83,13 @@ def get_scene(scene_id: ObjectId, database: DatabaseDep) -> Scene:
     """A scene: what is declared of it, and the archive with the arrays among its artifacts."""
     with database.reading() as session:
         return resources.get_scene(session, scene_id)
+
+
+@router.patch("/{scene_id}", responses=documented(401, 403, 404, 413, 422))
+def patch_scene(scene_id: ObjectId, body: ScenePatch, database: DatabaseDep) -> Scene:
+    """Give a scene other tags. The recording itself never changes."""
+    with database.session() as session:
+        return resources.patch_scene(session, scene_id, body)
 
 
 def _preview(upload: Upload, parsers: Parsers, idempotency: Idempotency) -> Response:

@@ -1,33 +1,36 @@
 """What no schema can say to a generator of requests, for ``st run`` with ``SCHEMATHESIS_HOOKS`` (CONTRIBUTING.md).
 
 A cursor is what the page before gave out, an idempotency key is new for each request, an upload is a recording (any
-other is refused with 422 as documented), a wait for a job's end is short, and what a path names is there: of most
-requests that are meant to be right, the ids in the path are those of something that the service has, found by listing
-the collection before them. What would delete or cancel it keeps made-up ids. The contract tests ask for these refusals
-and for long waits themselves.
+other is refused with 422 as documented), a wait for a job's end is short, and what a path or a body names is there: of
+most requests that are meant to be right, the ids are those of something that the service has, found by listing the
+collection before them. What a request deletes, cancels, retries or rotates is made for it (``schemathesis_real``). The
+contract tests ask for the refusals and for long waits themselves.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 import random
-import time
+from typing import Any
 from uuid import uuid4
 
-import httpx
 import schemathesis
 from schemathesis import Case, GenerationMode, HookContext
+from schemathesis_real import Answers, Real
 
 TOKEN = "PHYSWORLD_TOKEN"
 """Variable of the key; without it the ids stay made up."""
 MOST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0
 """How long a request for a job waits here, lest queued jobs hold the run up, and how long it might."""
-KNOWN_S = 20.0
-"""How long a listing is remembered."""
 SHARE = 0.8
 """Of the requests that are meant to be right, those that ask for what is there."""
-_LISTED: dict[str, tuple[float, list[str]]] = {}
+WHOLE = {"/v1/rollouts": Real.rollout, "/v1/plans": Real.plan}
+"""Bodies whose arrays have to be of the model's sizes: half of the requests take these."""
+_SERVICES: dict[str, Real] = {}
 _RANDOM = random.Random(0)
+_ANSWERS = Answers()
+atexit.register(_ANSWERS.write)
 
 
 @schemathesis.hook
@@ -41,10 +44,47 @@ def before_call(context: HookContext, case: Case, kwargs: dict[str, object]) -> 
         case.query.pop("cursor", None)
     if "Idempotency-Key" in (case.headers or {}):
         case.headers["Idempotency-Key"] = uuid4().hex
-    ending = case.method.upper() == "DELETE" or case.path.endswith(("/cancel", "/rotate"))
-    asked = bool(case.path_parameters) and TOKEN in os.environ
-    if asked and not ending and _RANDOM.random() < SHARE:
-        _name_what_is_there(case)
+    if TOKEN not in os.environ or _RANDOM.random() >= SHARE:
+        return
+    real = _service(case)
+    if isinstance(case.body, dict):
+        case.body = _body(case, real)
+    ending = real.ends.get((case.method.upper(), case.path))
+    if ending is not None:
+        case.path_parameters.update(ending() or {})
+    elif case.path_parameters and case.method.upper() != "DELETE":
+        _name_what_is_there(case, real)
+    if case.path.endswith("/aliases/{alias}") and case.method.upper() == "PUT":
+        case.body = {"version": real.latest(case.path_parameters["name"])}
+
+
+@schemathesis.hook
+def after_call(context: HookContext, case: Case, response: Any) -> None:
+    """Keep which operations ever succeeded."""
+    _ANSWERS.add(f"{case.method.upper()} {case.path}", response.status_code)
+
+
+def _service(case: Case) -> Real:
+    base = case.operation.schema.get_base_url().rstrip("/")
+    if base not in _SERVICES:
+        _SERVICES[base] = Real(base, os.environ[TOKEN])
+    return _SERVICES[base]
+
+
+def _body(case: Case, real: Real) -> dict[str, Any]:
+    """The body with real names in it."""
+    if case.path in WHOLE and _RANDOM.random() < 0.5:
+        return WHOLE[case.path](real)
+    if case.path in ("/v1/scenes", "/v1/scenes/preview"):
+        return {"bundle": real.archive()}
+    if case.path.endswith("/pictures/{name}"):
+        case.path_parameters["name"] = "splat.ply"
+        return {"bundle": b"ply\nformat binary_little_endian 1.0\nend_header\n"}
+    if case.path == "/v1/videos":
+        return {**case.body, "of": "scene", "id": real.one("/v1/scenes")}
+    if case.path == "/v1/loops":
+        return {"model": real.one("/v1/models", "name"), "scene_id": real.one("/v1/scenes")}
+    return real.named(case.body)
 
 
 def _number(value: object) -> float:
@@ -55,28 +95,19 @@ def _number(value: object) -> float:
         return float("inf")
 
 
-def _name_what_is_there(case: Case) -> None:
+def _name_what_is_there(case: Case, real: Real) -> None:
     """Ids of the path from left to right, each out of the listing of what stands before it."""
     path = ""
     for part in case.path.strip("/").split("/"):
         if part.startswith("{"):
             parameter = part.strip("{}")
-            known = _listed(case, path, "id" if parameter.endswith("_id") else parameter)
+            if parameter == "sha256":
+                case.path_parameters[parameter] = real.digest()
+                return
+            if parameter in case.path_parameters and path.endswith("/pictures"):
+                return
+            known = real.listed(path, "id" if parameter.endswith("_id") else parameter)
             if not known:
                 return
             part = case.path_parameters[parameter] = _RANDOM.choice(known)
         path += f"/{part}"
-
-
-def _listed(case: Case, path: str, key: str) -> list[str]:
-    """How paths name what the collection at ``path`` has."""
-    at, known = _LISTED.get(path, (0.0, []))
-    if known and time.monotonic() - at < KNOWN_S:
-        return known
-    base = case.operation.schema.get_base_url().rstrip("/")
-    headers = {"Authorization": f"Bearer {os.environ[TOKEN]}"}
-    answer = httpx.get(f"{base}{path}", headers=headers, timeout=30.0)
-    data = answer.json().get("data", []) if answer.status_code == 200 else []
-    known = [str(item[key]) for item in data if key in item]
-    _LISTED[path] = (time.monotonic(), known)
-    return known

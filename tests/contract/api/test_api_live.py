@@ -18,15 +18,19 @@ from serving import log_in
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
+from physworld.twin.live import LiveTwin
 from physworld_schemas.model import TrainingConfig
 from physworld_services.api.attempts import PER_ADDRESS
 from physworld_services.api.routes import live as api_live
 from physworld_services.inference import live
-from physworld_services.inference.session import HEAD
+from physworld_services.inference.companion import MOST_BEHIND_S
+from physworld_services.inference.session import HEAD, OF_TWIN
 from physworld_storage import registry
 from physworld_storage.access import api_keys
 
 WITHIN_S = 20.0
+TWIN_S = 200.0
+"""A twin's process loads the engine first, which takes its time on a busy machine."""
 SINGLE_PRECISION_M = 2e-6
 
 
@@ -47,13 +51,18 @@ def address(served: Served, path: str) -> str:
     return served.url.replace("http", "ws", 1) + path
 
 
-def run(served: Served, work: Callable[[ClientConnection, dict], Awaitable[None]], frames: int = 1) -> None:
+def run(
+    served: Served,
+    work: Callable[[ClientConnection, dict], Awaitable[None]],
+    frames: int = 1,
+    within_s: float = WITHIN_S,
+) -> None:
     """Open a session with a ticket and do ``work`` with it and the first message."""
 
     async def session() -> None:
         where = address(served, f"{path_of(served)}&frames={frames}")
         async with connect(where, proxy=None) as socket:
-            await asyncio.wait_for(work(socket, json.loads(await socket.recv())), WITHIN_S)
+            await asyncio.wait_for(work(socket, json.loads(await socket.recv())), within_s)
 
     asyncio.run(session())
 
@@ -401,3 +410,120 @@ def test_a_client_that_reads_no_more_loses_its_place(served: Served, monkeypatch
             await socket.wait_closed()
 
     asyncio.run(asyncio.wait_for(work(), 60.0))
+
+
+def twin_text(texts: list[dict], state: str) -> dict | None:
+    return next((told for told in reversed(texts) if told["state"] == state), None)
+
+
+def test_the_twin_runs_beside_the_model_on_the_same_grips(served: Served) -> None:
+    """In step, each at its own colour of frames: the twin's are those of the engine under what the grips did."""
+    _, twin, model = tiny_model()
+
+    async def work(socket: ClientConnection, ready: dict) -> None:
+        texts: list[dict] = []
+        driven: dict[int, np.ndarray] = {}
+        bodies: dict[int, np.ndarray] = {}
+        await socket.send(json.dumps({"type": "twin", "on": True}))
+        number, newest, step = 0, 0, 0
+        while len(bodies) < 60 or newest - step > 3:  # as many frames, and at their end in step
+            message = await socket.recv()
+            if isinstance(message, str):
+                texts.append(json.loads(message))
+                continue
+            head, points, controllers = frame(message, ready)
+            if twin_text(texts, "running") is None:
+                continue
+            number += 1
+            if len(bodies) < 60:
+                await socket.send(control(number, [0.0, 0.0, 0.1 * np.sin(0.2 * number)]))
+            if head[3] & OF_TWIN:
+                bodies[head[0]], step = points, head[0]
+            else:
+                if head[0] < newest:  # both begin anew once the twin is there
+                    driven, bodies, step = {}, {}, 0
+                newest = head[0]
+            driven[head[0]] = controllers.astype(float)
+        assert texts[0] == {"type": "twin", "state": "starting"}
+        told = twin_text(texts, "running")
+        assert told is not None and told["strengths"] == [] and told["behind_s"] < MOST_BEHIND_S
+        last = max(tick for tick in bodies if all(before in driven for before in range(1, tick + 1)))
+        assert last > 30
+        path = np.concatenate([model.start_controllers, [driven[tick] for tick in range(1, last + 1)]])
+        alone = LiveTwin(twin, model.spec.dt_s)
+        for places in path[1:]:
+            particles = alone.step(places)
+        expected = model.skin.apply(particles[model.spec.particle_index][None])[0]
+        assert np.abs(path[-1] - path[0]).max() > 5e-3
+        assert bodies[last] == pytest.approx(expected, abs=5e-4)
+
+    run(served, work, within_s=TWIN_S)
+
+
+def test_a_twin_that_cannot_be_run_live_is_refused_in_words_and_the_session_goes_on(served: Served) -> None:
+    name, version = publish_tiny(
+        served.database,
+        served.stores.artifacts,
+        name="tiny-slips",
+        acting=("grip_slip", {"compliance_m_n": 1e-3}),
+    )
+
+    async def session() -> None:
+        with served.client() as client:
+            path = client.post("/v1/live/tickets", json={"model": name, "version": version}).json()["path"]
+        async with connect(address(served, path), proxy=None) as socket:
+            ready = json.loads(await socket.recv())
+            await socket.send(json.dumps({"type": "twin", "on": True}))
+            told = None
+            while told is None or told["state"] == "starting":
+                message = await asyncio.wait_for(socket.recv(), TWIN_S)
+                told = json.loads(message) if isinstance(message, str) else told
+            assert told["state"] == "refused"
+            assert "grip_slip pulls along the whole path of the grips" in told["reason"]
+            while isinstance(message := await socket.recv(), str):
+                pass
+            frame(message, ready)
+
+    asyncio.run(session())
+
+
+def test_strengths_that_the_model_was_not_trained_over_act_on_the_twin_alone(served: Served) -> None:
+    drag = ("air_drag_linear", {"rate_per_s": 2.0})
+    name, version = publish_tiny(served.database, served.stores.artifacts, name="tiny-acting", acting=drag)
+
+    async def session() -> None:
+        with served.client() as client:
+            path = client.post("/v1/live/tickets", json={"model": name, "version": version}).json()["path"]
+        async with connect(address(served, path), proxy=None) as socket:
+            ready = json.loads(await socket.recv())
+            assert ready["strengths"] == []
+            await socket.send(json.dumps({"type": "twin", "on": True}))
+            told, moved, number, asked = None, [], 0, False
+            while len(moved) < 40:
+                message = await asyncio.wait_for(socket.recv(), TWIN_S)
+                if isinstance(message, str):
+                    told = json.loads(message)
+                    continue
+                if told is None or told["state"] != "running":
+                    continue
+                (strength,) = told["strengths"]
+                assert (strength["name"], strength["unit"]) == ("air_drag_linear.rate_per_s", "1/s")
+                assert strength["low"] <= strength["value"] == 2.0 < strength["high"]
+                if not asked:
+                    told_strengths = {"factors": {}, "strengths": {strength["name"]: strength["high"]}}
+                    await socket.send(json.dumps({"type": "factors", **told_strengths}))
+                    asked = True
+                head, points, _ = frame(message, ready)
+                if head[3] & OF_TWIN:
+                    moved.append(points)
+                number += 1
+                await socket.send(control(number, [0.0, 0.0, 0.05]))
+            await socket.send(
+                json.dumps({"type": "factors", "factors": {}, "strengths": {strength["name"]: 1e9}})
+            )
+            with pytest.raises(ConnectionClosed) as ended:
+                while True:
+                    await asyncio.wait_for(socket.recv(), TWIN_S)
+            assert ended.value.rcvd is not None and "it may be" in ended.value.rcvd.reason
+
+    asyncio.run(session())

@@ -5,11 +5,14 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
+import json
 import zipfile
+from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 from api_service import EPISODE, Service, assert_problem, scene_id, sha256
 from physworld_client.export import FORMATS
@@ -229,3 +232,49 @@ def test_an_episode_that_lost_a_chunk_is_not_given_out(service: Service) -> None
         assert "particles do not have the digest" in problem["detail"]
         shown = client.get(f"/dashboard/{address}/cloud", headers=cookie)
         assert shown.status_code == 500 and "particles do not have the digest" in shown.text
+
+
+@pytest.mark.parametrize("form", sorted(FORMATS))
+def test_a_dataset_is_exported_as_one_zip(
+    client: httpx.Client, chain: dict[str, Any], form: str, tmp_path: Path
+) -> None:
+    response = client.get(f"/v1/datasets/{chain['dataset']}/export", params={"format": form, "points": 5})
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == "application/zip"
+    assert f'filename="{chain["dataset"]}-{form}.zip"' in response.headers["content-disposition"]
+    with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
+        assert archive.testzip() is None
+        archive.extractall(tmp_path)
+    top = tmp_path / chain["dataset"]
+    assert json.loads((top / "dataset.json").read_text())["id"] == chain["dataset"]
+    frames = len(EPISODE["times"])
+    if form == "npz":
+        with np.load(top / "episode-00001.npz", allow_pickle=False) as arrays:
+            np.testing.assert_array_equal(arrays["particles"], EPISODE["particles"])
+            assert str(arrays["attributes"]) == '{"motion": "bezier"}'
+    elif form == "ply":
+        assert len(list(top.glob("episode-0000?/frame-*.ply"))) == 3 * frames
+    else:
+        info = json.loads((top / "meta/info.json").read_text())
+        assert (info["codebase_version"], info["total_episodes"], info["total_frames"]) == (
+            "v3.0",
+            3,
+            3 * frames,
+        )
+        table = parquet.read_table(top / "data/chunk-000/file-000.parquet")
+        assert table.num_rows == 3 * frames
+        assert info["features"]["observation.environment_state"]["shape"] == [
+            3 * min(5, EPISODE["particles"].shape[1])
+        ]
+
+
+def test_what_cannot_be_exported_is_refused(
+    client: httpx.Client, chain: dict[str, Any], service: Service
+) -> None:
+    address = f"/v1/datasets/{chain['dataset']}/export"
+    assert_problem(client.get(address, params={"format": "hdf5"}), 422, "invalid_request")
+    assert_problem(client.get(address, params={"points": 0}), 422, "invalid_request")
+    assert_problem(client.get("/v1/datasets/dst_00000000000000000000000000/export"), 404, "not_found")
+    job = client.post("/v1/datasets", json={"fit_id": chain["fit"]}).json()
+    assert_problem(client.get(f"/v1/datasets/{job['outputs'][0]['id']}/export"), 409, "conflict")
+    client.post(f"/v1/jobs/{job['id']}/cancel")

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import httpx
 import numpy as np
-from api_service import Service, archive, assert_problem, bundle, upload
+from api_service import Service, archive, assert_problem, bundle, scene_id, upload
 from conftest import MAX_UPLOAD_BYTES
 
 
@@ -175,3 +175,22 @@ def _huge_npy() -> bytes:
     header = header.ljust(117) + b"\n"
     array = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
     return archive({"scene.json": b"{}", "scene.npz": archive({"points.npy": array})})
+
+
+def test_tags_of_a_scene_are_set_and_searched_by(client: httpx.Client) -> None:
+    address = f"/v1/scenes/{scene_id(client)}"
+    before = client.get(address).json()
+    changed = client.patch(address, json={"tags": ["soft", "Tag zwei", "größer", "soft"]})
+    assert changed.status_code == 200, changed.text
+    assert changed.json() == client.get(address).json() == {**before, "tags": ["soft", "Tag zwei", "größer"]}
+    for tag in ("soft", "tag ZWEI", "größer"):
+        found = client.get("/v1/scenes", params={"tag": tag}).json()["data"]
+        assert [item["id"] for item in found] == [before["id"]]
+    for tag in ("sof", "zwei", "%"):
+        assert client.get("/v1/scenes", params={"tag": tag}).json()["data"] == []
+    assert_problem(client.patch(address, json={"tags": [""]}), 422, "invalid_request")
+    assert_problem(client.patch(address, json={"name": "other"}), 422, "invalid_request")
+    assert_problem(
+        client.patch("/v1/scenes/scn_00000000000000000000000000", json={"tags": []}), 404, "not_found"
+    )
+    assert client.patch(address, json={"tags": []}).json()["tags"] == []

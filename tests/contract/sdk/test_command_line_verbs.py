@@ -38,6 +38,18 @@ def test_an_object_is_found_by_id_by_the_beginning_of_one_and_by_name(client: Cl
         found(client, "scenes", "strap")
 
 
+def test_a_scene_is_tagged_and_found_by_its_tag(
+    service: Service, client: Client, scene_id: str, tmp_path: Path
+) -> None:
+    told = output_of(service, tmp_path, "scenes", "describe", "strip", "--tag", "soft", "--tag", "day 2")
+    assert told["tags"] == ["soft", "day 2"]
+    listed = output_of(service, tmp_path, "scenes", "list", "--tag", "day 2")
+    assert [scene["id"] for scene in listed] == [scene_id]
+    assert [scene.id for scene in client.scenes.list(tag="soft").auto_paging_iter()] == [scene_id]
+    assert client.scenes.update("strip", tags=()).tags == []
+    assert list(client.scenes.list(tag="soft").auto_paging_iter()) == []
+
+
 def test_a_fit_a_dataset_and_a_model_are_started_with_settings(
     service: Service, scene_id: str, tmp_path: Path
 ) -> None:

@@ -46,7 +46,8 @@ def test_a_measured_rope_goes_the_way_of_the_finished_run_as_its_grip_turns(meas
     middle = points.mean(axis=1, keepdims=True)
     angles = np.linspace(0.0, 2.5, TICKS + 1)
     turned = [
-        Rotation.from_rotvec([angle, 0.3 * angle, 0.0]).apply(p) for angle, p in zip(angles, points - middle)
+        Rotation.from_rotvec([angle, 0.3 * angle, 0.0]).apply(p)
+        for angle, p in zip(angles, points - middle, strict=True)
     ]
     points = middle + np.array(turned)
     live = LiveTwin(twin, DT_S)

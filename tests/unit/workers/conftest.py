@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import os
+import shutil
+import sqlite3
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from tiny_scene import register, tiny_scene
 
+from physworld_schemas.fit import Fit, FitConfig
 from physworld_services.embedded.broker import choose_broker
 from physworld_services.embedded.child import Child, Program
 from physworld_services.embedded.folder import DataFolder
+from physworld_storage import resources
 from physworld_storage.database import open_database
+from physworld_storage.jobs import jobs, leases
 from physworld_storage.settings import Settings
 from physworld_workers.context import Handler
-from physworld_workers.execute import Runtime
+from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.owner import process_owner
 from physworld_workers.stores import Stores
 
 BROKER_WITHIN_S = 20.0
+DATABASE = "physworld.db"
 RuntimeOf = Callable[..., Runtime]
 
 
@@ -30,7 +37,7 @@ def settings(tmp_path: Path) -> Settings:
     (tmp_path / "file").write_text("")
     return Settings(
         data_dir=tmp_path / "file" / "data",
-        database_url=f"sqlite:///{tmp_path / 'physworld.db'}",
+        database_url=f"sqlite:///{tmp_path / DATABASE}",
         store_url=(tmp_path / "store").as_uri(),
         lease_seconds=5.0,
     )
@@ -60,6 +67,43 @@ def runtime_with(settings: Settings, stores: Stores) -> RuntimeOf:
         return Runtime(settings, stores.database, stores, process_owner(), handlers.__getitem__)
 
     return make
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Fit]:
+    """A folder with a database and a store, and the fit that the real handler made in it."""
+    folder = tmp_path_factory.mktemp("fitted")
+    settings = Settings(
+        data_dir=folder / "data",
+        database_url=f"sqlite:///{folder / DATABASE}",
+        store_url=(folder / "store").as_uri(),
+    )
+    database = open_database(settings)
+    database.upgrade()
+    stores = Stores(settings, database)
+    scene_id = register(tiny_scene(), database, stores.artifacts)
+    with database.session() as session:
+        job = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=6))
+    with database.reading() as session:
+        (shard,) = leases.publishable(session)
+    assert run_shard(Runtime(settings, database, stores, process_owner()), shard.shard_id) == "done"
+    with database.reading() as session:
+        made = resources.get_fit(session, job.outputs[0].id)
+    database.dispose()
+    return folder, made
+
+
+@pytest.fixture
+def fit(fitted: tuple[Path, Fit], stores: Stores, tmp_path: Path) -> Fit:
+    """The fit, in the test's own database and store."""
+    folder, made = fitted
+    shutil.copytree(folder / "store", tmp_path / "store", dirs_exist_ok=True)
+    with (
+        closing(sqlite3.connect(folder / DATABASE)) as one,
+        closing(sqlite3.connect(tmp_path / DATABASE)) as own,
+    ):
+        one.backup(own)
+    return made
 
 
 @pytest.fixture

@@ -53,15 +53,6 @@ def _job(stores: Stores, job: Job) -> Job:
         return jobs.get_job(session, job.id)
 
 
-@pytest.fixture
-def fit(runtime_with, stores: Stores, scene_id: str) -> Fit:
-    with stores.database.session() as session:
-        job = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=6))
-    assert _drain(runtime_with()) == ["done"]
-    with stores.database.reading() as session:
-        return resources.get_fit(session, job.outputs[0].id)
-
-
 def _make_dataset(runtime: Runtime, fit: Fit, **config: int) -> tuple[Job, Dataset]:
     with runtime.database.session() as session:
         job = jobs.create_dataset(session, fit.id, DatasetConfig(**config))

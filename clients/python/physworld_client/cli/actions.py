@@ -72,6 +72,19 @@ def scenes_add(
         stdout.print(line, markup=False, soft_wrap=True)
 
 
+@connected(GROUPS["scenes"], "describe")
+def scenes_describe(
+    client: Client,
+    scene_id: SceneName,
+    tag: Annotated[
+        list[str] | None, typer.Option(help="Tags from now on; repeatable; none: no tags.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Give a scene other tags; the recording never changes."""
+    show(client.scenes.update(scene_id, tags=tuple(tag or ())), json)
+
+
 @connected(GROUPS["scenes"], "picture")
 def scenes_picture(
     client: Client,

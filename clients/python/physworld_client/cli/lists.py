@@ -104,7 +104,7 @@ class Resource:
 
 def _scene(scene: Scene) -> Sequence[object]:
     counts = (scene.frames, scene.points, scene.controllers)
-    return (scene.id, scene.name, scene.kind, *counts, ago(scene.created_at))
+    return (scene.id, scene.name, scene.kind, *counts, ", ".join(scene.tags), ago(scene.created_at))
 
 
 def _fit(fit: Fit) -> Sequence[object]:
@@ -225,8 +225,12 @@ def held_out_errors(trace: Trace) -> str:
 SCENES = Listing(
     "list",
     "Scenes, newest first.",
-    ("id", "name", "kind", "frames", "points", "controllers", "age"),
+    ("id", "name", "kind", "frames", "points", "controllers", "tags", "age"),
     _scene,
+    filters=(
+        ("kind", "kind", "Only objects of this kind."),
+        ("tag", "tag", "Only scenes that have this tag."),
+    ),
 )
 FITS = Listing("list", "Fits, newest first.", ("id", "scene", "state", "parameters", "age"), _fit)
 CHECKS = Listing(

@@ -23,10 +23,14 @@ DATASET_FILE = "dataset.json"
 
 
 class Writer(Protocol):
-    """What every format has: a title and help for the catalogue, and how it takes a folder and a number of points."""
+    """What every format has: a title and help for the catalogue, and how it takes a folder and a number of points.
+
+    Files but ``unfinished`` are as they will be once an episode is added: whoever sends them on may take them away.
+    """
 
     title: ClassVar[str]
     help: ClassVar[str]
+    unfinished: Path | None
 
     def __init__(self, folder: Path, points: int | None = None) -> None: ...
 

@@ -66,6 +66,7 @@ class LeRobotWriter:
     def __init__(self, folder: Path, points: int | None = None) -> None:
         _parquet()
         self._folder = folder
+        self.unfinished: Path | None = None
         self._points = DEFAULT_POINTS if points is None else points
         self._chosen = np.empty(0, dtype=np.int64)
         self._shape: tuple[int, int] | None = None
@@ -95,6 +96,7 @@ class LeRobotWriter:
         if self._writer is None:
             path = self._folder / DATA_PATH.format(**self._place())
             path.parent.mkdir(parents=True, exist_ok=True)
+            self.unfinished = path
             self._writer = _parquet().ParquetWriter(path, table.schema, compression="snappy")
         self._writer.write_table(table, row_group_size=len(table))
         self._written_bytes += table.nbytes
@@ -225,7 +227,7 @@ class LeRobotWriter:
     def _close(self) -> None:
         if self._writer is not None:
             self._writer.close()
-        self._writer, self._written_bytes = None, 0
+        self._writer, self._written_bytes, self.unfinished = None, 0, None
 
 
 class _Totals:

@@ -20,6 +20,7 @@ class NpzWriter:
 
     def __init__(self, folder: Path, points: int | None = None) -> None:
         self._folder = folder
+        self.unfinished: Path | None = None
         self._count = 0
 
     def add(self, index: int, arrays: Mapping[str, Array]) -> None:

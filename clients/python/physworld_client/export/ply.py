@@ -35,6 +35,7 @@ class PlyWriter:
 
     def __init__(self, folder: Path, points: int | None = None) -> None:
         self._folder, self._points = folder, points
+        self.unfinished: Path | None = None
         self._count = 0
 
     def add(self, index: int, arrays: Mapping[str, Array]) -> None:

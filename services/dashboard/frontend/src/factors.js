@@ -24,6 +24,26 @@ export class Factors {
     if (this.touched) this.tell();
   }
 
+  /** Offer the strengths that act on the twin beside the model alone; none where there is no twin. */
+  beside(strengths) {
+    const own = new Set([...this.box.querySelectorAll("input:not([data-beside])")].map((input) => input.name));
+    const offered = strengths.filter(({ name }) => !own.has(name));
+    const names = offered.map(({ name }) => name).join();
+    if (names === (this.offered ?? "")) return;
+    this.offered = names;
+    for (const input of this.box.querySelectorAll("input[data-beside]")) {
+      delete this.strengths[input.name];
+      input.parentElement.remove();
+    }
+    for (const strength of offered) {
+      const made = this.strength({ ...strength, label: `${strength.label} (twin only)` });
+      made.title = "The model was not trained over this strength: the slider acts on the twin beside it";
+      made.querySelector("input").dataset.beside = "";
+      this.box.append(made);
+    }
+    this.box.hidden = this.box.childElementCount === 0;
+  }
+
   tell() {
     this.touched = true;
     this.changed(this.factors, this.strengths);

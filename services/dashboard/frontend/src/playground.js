@@ -2,7 +2,8 @@
 // POST to URL gives { path }, the WebSocket's address with a ticket. The first message is JSON: { dt_s, points,
 //   controllers [[x, y, z]], grips [[index]], speed_m_s, reach_m, factors [name], strengths [{ name, label, unit,
 //   low, high, value }], start [[x, y, z]] }. Then binary frames, little-endian:
-//   uint32 tick, uint32 number of the last control, float32 time, uint32 flags, float32 points and controllers [m].
+//   uint32 tick, uint32 number of the last control, float32 time, uint32 flags, float32 points and controllers [m]; those
+//   with flag 2 are of the twin (`twin.js`), of which texts { type: "twin" } tell.
 // A control is uint32 number, float32 velocities (grips, 3) [m/s]: a dragged grip is steered towards the pointer.
 
 import { Plane, Raycaster, Vector2, Vector3 } from "three";
@@ -11,10 +12,13 @@ import { Factors } from "./factors.js";
 import { Ghost } from "./ghost.js";
 import { Cloud } from "./points.js";
 import { Recorder } from "./record.js";
+import { Splat } from "./splat.js";
 import { bodyOf } from "./surface.js";
+import { LiveTwin } from "./twin.js";
 import { View } from "./view.js";
 
 const HEAD_BYTES = 16;
+const OF_TWIN = 2; // a flag of frames
 const PICK_PIXELS = { mouse: 28, pen: 32, touch: 48 };
 const SETTLE_S = 0.5; // after the end of the recorded motion, to arrive
 const STILL = 1e-3; // of the body's size: a grip that is so near its target stays where it is
@@ -63,6 +67,8 @@ class Playground {
     this.frames = 0;
     this.clouds = [];
     this.factors = new Factors(figure.querySelector("[data-factors]"), (factors, strengths) => this.tell({ type: "factors", factors, strengths }));
+    const offer = (strengths) => this.factors.beside(strengths);
+    this.twin = new LiveTwin(figure, this.view.scene, (message) => this.tell(message), offer);
     const pressed = (name, then) => figure.querySelector(`[data-${name}]`).addEventListener("click", then);
     pressed("reset", () => this.again());
     pressed("view", () => this.look());
@@ -87,20 +93,30 @@ class Playground {
     const { path } = await answer.json();
     this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`);
     this.socket.binaryType = "arraybuffer";
-    this.socket.onmessage = (event) => (typeof event.data === "string" ? this.begin(event.data) : this.take(event.data));
+    this.socket.onmessage = (event) => (typeof event.data === "string" ? this.hear(JSON.parse(event.data)) : this.take(event.data));
     this.socket.onclose = (event) => this.say(`The session ended: ${event.reason || ENDED[event.code] || "the connection broke"}. Press Start again.`);
   }
 
-  /** The body's surface and the recording, where there are any; the session does not wait for them. */
+  /** A text of the service. */
+  hear(message) {
+    if (message.type === "twin") this.twin.told(message);
+    else this.begin(message);
+  }
+
+  /** The body's surface, its splat and the recording, where there are any; the session does not wait for them. */
   async accompany() {
     const load = async (url) => { const answer = await fetch(url); return answer.ok ? answer.json() : null; };
-    const [surface, ghost] = await Promise.all([load(this.figure.dataset.surface), Ghost.load(this.figure.dataset.ghost)]);
+    const { surface: skin, ghost: recording, splat: look } = this.figure.dataset;
+    const [surface, ghost, splat] = await Promise.all([load(skin), Ghost.load(recording), Splat.load(look)]);
     this.ghost = ghost;
+    this.splat = splat;
+    if (splat) this.view.scene.add(splat.mesh);
+    this.twin.dress(surface);
     if (surface) {
       this.surface = bodyOf(surface);
       this.view.scene.add(this.surface.mesh);
     }
-    const offered = { surface: Boolean(surface), measured: ghost?.has("measured"), twin: ghost?.has("twin") };
+    const offered = { surface: Boolean(surface), splat: Boolean(splat), measured: ghost?.has("measured"), twin: ghost?.has("twin") };
     for (const [name, there] of Object.entries(offered)) this.figure.querySelector(`[data-for="${name}"]`).hidden = !there;
     this.figure.querySelector("[data-replay]").hidden = !ghost?.has("controllers");
     await this.dress();
@@ -110,14 +126,15 @@ class Playground {
   /** Draw what the boxes say. */
   async dress() {
     const wanted = (name) => this.figure.querySelector(`[data-show="${name}"]`).checked;
-    if (this.surface) this.surface.mesh.visible = wanted("surface") && Boolean(this.body);
-    if (this.body) this.body.points.visible = !this.surface?.mesh.visible;
+    if (this.splat) this.splat.mesh.visible = wanted("splat") && Boolean(this.body);
+    if (this.surface) this.surface.mesh.visible = wanted("surface") && Boolean(this.body) && !this.splat?.mesh.visible;
+    if (this.body) this.body.points.visible = !this.surface?.mesh.visible && !this.splat?.mesh.visible;
     if (this.ghost) {
       await Promise.all(["measured", "twin"].map((name) => this.ghost.show(name, this.view.scene, wanted(name))));
       this.ghost.stale = true;
       this.ghost.at(this.ghost.start);
     }
-    if (this.surface && this.latest) this.surface.set(this.latest);
+    if (this.latest) for (const part of [this.surface, this.splat]) part?.set(this.latest);
     this.resize();
   }
 
@@ -160,8 +177,7 @@ class Playground {
     return true;
   }
 
-  begin(text) {
-    const ready = JSON.parse(text);
+  begin(ready) {
     this.ready = ready;
     for (const cloud of this.clouds) this.view.scene.remove(cloud.points);
     this.body = new Cloud(ready.points, "model", Math.min(0.05, Math.max(0.012, 0.45 / Math.sqrt(ready.points))));
@@ -170,6 +186,7 @@ class Playground {
     this.clouds = [this.body, this.markers, this.handles];
     for (const cloud of [this.markers, this.handles]) { // a grip may lie inside the body
       cloud.material.depthTest = false;
+      cloud.material.transparent = true; // drawn after a twin that is seen through, and after a splat
       cloud.points.renderOrder = 2;
     }
     for (const cloud of this.clouds) this.view.scene.add(cloud.points);
@@ -178,6 +195,7 @@ class Playground {
     this.dress();
     this.places = this.grips(new Float32Array(ready.controllers.flat()));
     this.factors.offer(ready.factors, ready.strengths ?? []);
+    this.twin.begin(ready.points, ready.dt_s);
     this.say("");
     this.figure.dataset.ready = "true";
   }
@@ -208,12 +226,17 @@ class Playground {
 
   take(buffer) {
     const now = performance.now();
-    const [, number] = new Uint32Array(buffer, 0, 2);
-    this.acknowledged = number;
+    const [tick, number, , flags] = new Uint32Array(buffer, 0, 4);
     const values = new Float32Array(buffer, HEAD_BYTES);
     const size = this.ready.points * 3;
+    if (flags & OF_TWIN) {
+      this.twin.take(tick, values.subarray(0, size));
+      return;
+    }
+    this.acknowledged = number;
+    this.twin.follow(tick, values.subarray(0, size));
     this.latest = values.subarray(0, size);
-    if (this.surface?.mesh.visible) this.moved = true;
+    if (this.surface?.mesh.visible || this.splat?.mesh.visible) this.moved = true;
     else this.body.set(this.latest);
     this.recorder.take(new Float32Array(buffer, 8, 1)[0], values);
     const controllers = values.subarray(size);
@@ -337,8 +360,10 @@ class Playground {
   draw(now) {
     requestAnimationFrame((next) => this.draw(next));
     this.steer(now);
-    if (this.moved) this.surface.set(this.latest);
+    for (const part of [this.surface, this.splat]) if (this.moved && part?.mesh.visible) part.set(this.latest);
     this.moved = false;
+    this.twin.draw();
+    if (this.splat?.mesh.visible) this.splat.sort(this.view.camera, this.canvas);
     this.view.render();
     this.drawn.add(performance.now());
     if (now - (this.toldAt ?? 0) < 250) return;
@@ -351,13 +376,14 @@ class Playground {
   paint() {
     for (const cloud of [...this.clouds, ...(this.ghost?.clouds ?? [])]) cloud.paint();
     this.surface?.paint();
+    this.twin.paint();
     this.view.paint();
   }
 
   resize() {
     if (!this.view.resize()) return;
     const scale = this.view.pixels * (this.radius ?? 1);
-    for (const cloud of [...this.clouds, ...(this.ghost?.clouds ?? [])]) cloud.material.uniforms.scale.value = scale;
+    for (const cloud of [...this.clouds, ...this.twin.clouds, ...(this.ghost?.clouds ?? [])]) cloud.material.uniforms.scale.value = scale;
   }
 
   say(words) {

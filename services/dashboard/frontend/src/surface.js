@@ -76,7 +76,7 @@ const cross = new Vector3();
 const step = new Quaternion();
 
 /** Turn a quaternion towards the rotation of vertex i's neighbourhood. */
-function turn(quaternion, i, rest, now, neighbours, each) {
+export function turn(quaternion, i, rest, now, neighbours, each) {
   const a = moment.elements.fill(0);
   for (let n = i * each; n < (i + 1) * each; n += 1) {
     const j = neighbours[n];
@@ -103,7 +103,7 @@ function turn(quaternion, i, rest, now, neighbours, each) {
 }
 
 /** The rotation of a quaternion, row by row. */
-function matrix({ x, y, z, w }) {
+export function matrix({ x, y, z, w }) {
   return [
     1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
     2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
