@@ -16,6 +16,7 @@ import warp as wp
 
 from benchmarks.harness import Report, interleave, run_alone
 from benchmarks.speed.mpm import BUDGETS, MODULUS_PA, POISSON, make_block
+from benchmarks.verification.cases import rest_nodes
 from physworld.engine.gradients.tangent import InternalTangent
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.problem import HeldNodes, Problem
@@ -81,14 +82,8 @@ def measure(repeats: int, seed: int) -> Report:
     )
 
 
-def _rest(lattice: Lattice) -> np.ndarray:
-    rest = np.zeros((len(lattice.nodes), 3))
-    rest[:, : lattice.dim] = lattice.node_coordinates
-    return rest
-
-
 def _substep(lattice: Lattice, law: Law) -> Callable[[], float]:
-    rest = _rest(lattice)
+    rest = rest_nodes(lattice)
     engine = TotalLagrangian(Problem(lattice, law, rest, np.zeros(3)))
     velocity = np.zeros_like(rest)
     velocity[:, 0] = STRETCHING_PER_S * (rest[:, 0] - rest[:, 0].mean())
@@ -105,7 +100,7 @@ def _substep(lattice: Lattice, law: Law) -> Callable[[], float]:
 
 
 def _product(lattice: Lattice, law: Law, random: np.random.Generator) -> Callable[[], float]:
-    rest = _rest(lattice)
+    rest = rest_nodes(lattice)
     tangent = InternalTangent(lattice, law, np.ones(lattice.fill.size), rest, "cpu")
 
     def upload(values: np.ndarray) -> wp.array:

@@ -13,8 +13,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.check.discrepancy import Discrepancy
 from physworld.estimation.refit import prior_rows
-from physworld.estimation.unknowns import bounds_of
-from physworld.trace.left_out import Linear
+from physworld.trace.left_out import Linear, unbound
 
 _LEVELS = 28  # amplitudes that are tried, beside none
 _LEAST, _MOST = 0.05, 3e4  # of the noise
@@ -37,7 +36,7 @@ def marginal(linear: Linear, discrepancy: Discrepancy) -> tuple[float, float]:
     jacobian, residual = linear.jacobian, linear.residual
     prior_residual, prior_slope = prior_rows(linear.unknowns, linear.theta)
     precision = prior_slope.T @ prior_slope
-    free = _free(linear)
+    free = unbound(linear)
     inner = [
         (block.basis.T @ residual[block.rows], block.basis.T @ jacobian[block.rows])
         for block in discrepancy.blocks
@@ -74,13 +73,3 @@ def marginal(linear: Linear, discrepancy: Discrepancy) -> tuple[float, float]:
     best = int(np.argmax(found))
     top = float(total.max())
     return top + float(np.log(np.exp(total - top).sum())), float(kappas[best])
-
-
-def _free(linear: Linear) -> Array:
-    """Unknowns that no bound holds, (p,)."""
-    if not len(linear.unknowns):
-        return np.zeros(0, dtype=bool)
-    low, high = bounds_of(linear.unknowns)
-    room = 1e-6 * (high - low)
-    free: Array = (linear.theta > low + room) & (linear.theta < high - room)
-    return free

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.verification.cases import GRAVITY, Case, rest_nodes
+from benchmarks.verification.cases import GRAVITY, Case, hold, rest_nodes
 from physworld.engine.lattice.lattice import Lattice, box_lattice, lattice_from_cells
-from physworld.engine.problem import HeldNodes, Problem
+from physworld.engine.problem import Problem
 from physworld.engine.terms.contact import GroundContact
 from physworld.engine.thin.self_contact import SelfContact
 from physworld.engine.total.energy import run_with_ledger
@@ -63,12 +63,6 @@ def laid(
     return nodes
 
 
-def still(nodes: np.ndarray, places: np.ndarray, frames: int) -> HeldNodes:
-    """Nodes held where they are; ``places`` (n, 3) [m]."""
-    positions = np.repeat(places[nodes][None], frames, axis=0)
-    return HeldNodes(nodes, positions, np.zeros_like(positions))
-
-
 def crossing(
     cells: float, friction: float, tilt_rad: float, axis: int
 ) -> tuple[TotalLagrangian, np.ndarray, np.ndarray]:
@@ -91,7 +85,7 @@ def slope(cells: float, axis: int) -> float:
     solver, nodes, rod = crossing(cells, friction, tilt, axis)
     rails = np.setdiff1d(np.arange(len(nodes)), rod)
     times = np.linspace(0.0, 0.2, 9)
-    moved = solver.run(nodes, 0 * nodes, still(rails, nodes, 9), times)
+    moved = solver.run(nodes, 0 * nodes, hold(rails, nodes, 9), times)
     mass = solver.mass[rod]
     way = np.einsum("n,tn->t", mass, moved[:, rod, axis]) / mass.sum()
     acceleration = 2 * np.polyfit(times[2:], way[2:], 2)[0]
@@ -102,7 +96,7 @@ def separation(cells: float) -> float:
     """How much nearer than a diameter a rod rests on two others that it crosses, over the diameter."""
     solver, nodes, rod = crossing(cells, 0.3, 0.0, 0)
     rails = np.setdiff1d(np.arange(len(nodes)), rod)
-    moved = solver.run(nodes, 0 * nodes, still(rails, nodes, 2), np.array([0.0, 1.0]))
+    moved = solver.run(nodes, 0 * nodes, hold(rails, nodes, 2), np.array([0.0, 1.0]))
     lattice = solver.problem.lattice
     over = begin_of(lattice, rod) + 0.1375 + np.array([-0.06, 0.067])
     return float((lattice.interpolation(over[:, None]) @ moved[-1])[:, 2].mean() / DIAMETER - 1)
@@ -122,7 +116,7 @@ def sliding_sheet(cells: float) -> float:
     solver = TotalLagrangian(
         Problem(lattice, CLOTH, nodes, GRAVITY, terms=(SelfContact(thickness, friction),))
     )
-    moved = solver.run(nodes, velocity, still(low, nodes, 2), np.array([0.0, 0.25]))
+    moved = solver.run(nodes, velocity, hold(low, nodes, 2), np.array([0.0, 0.25]))
     mass = solver.mass[top]
     way = np.einsum("n,tn->t", mass, moved[:, top, 0]) / mass.sum()
     return float((way[-1] - way[0]) / (speed**2 / (2 * friction * G)) - 1)
@@ -146,7 +140,7 @@ def belt(cells: float) -> float:
     nodes[rope] = np.stack([-radius * np.cos(angle), 0 * angle, radius * np.sin(angle) + down], axis=1)
     times = np.linspace(0, seconds, frames)
     order = rope[np.argsort(lattice.node_coordinates[rope, 0])]
-    held = still(np.concatenate([bar, order[:3], order[-3:]]), nodes, frames)
+    held = hold(np.concatenate([bar, order[:3], order[-3:]]), nodes, frames)
     for ends, sign in ((slice(len(bar), len(bar) + 3), 1.0), (slice(len(bar) + 3, None), -1.0)):
         held.positions[:, ends, 2] += sign * pull * times[:, None]
         held.velocities[:, ends, 2] = sign * pull
@@ -180,7 +174,7 @@ def momentum(cells: float) -> float:
     """Change of the linear and angular momentum of a free strip whose ends collide, over what they began with."""
     problem, nodes, velocity = closing(cells, 0.0, 1.0)
     solver, times = TotalLagrangian(problem), np.linspace(0, 0.2, 21)
-    run = Run(solver, nodes, velocity, still(NOBODY, nodes, 21), times)
+    run = Run(solver, nodes, velocity, hold(NOBODY, nodes, 21), times)
     mass, momenta = solver.mass[:, None], []
     for frame in range(20):
         place, push = run.advance(frame), mass * run.v.numpy().reshape(-1, 3)
@@ -193,7 +187,7 @@ def elastic(cells: float) -> float:
     """Energy that contact without damping or friction gave to a strip whose ends collided, over what turned over."""
     problem, nodes, velocity = closing(cells, 0.0, 0.0)
     times = np.linspace(0, 0.2, 51)
-    _, ledger = run_with_ledger(problem, nodes, velocity, still(NOBODY, nodes, 51), times)
+    _, ledger = run_with_ledger(problem, nodes, velocity, hold(NOBODY, nodes, 51), times)
     return float(ledger.term_work[-1] / ledger.turnover)
 
 
@@ -209,7 +203,7 @@ def layers(cells: float) -> float:
     nodes[:, 2] = radius * (1 - np.cos(angle)) + 0.5 * thickness
     terms = (GroundContact(0.0, 0.5, 0.5 * thickness), SelfContact(thickness, 0.3))
     problem = Problem(lattice, CLOTH, rest_nodes(lattice), GRAVITY, drag_per_s=2.0, terms=terms)
-    moved = TotalLagrangian(problem).run(nodes, 0 * nodes, still(NOBODY, nodes, 2), np.array([0.0, 0.6]))
+    moved = TotalLagrangian(problem).run(nodes, 0 * nodes, hold(NOBODY, nodes, 2), np.array([0.0, 0.6]))
     points = np.stack(np.meshgrid(np.linspace(0.24, 0.295, 12), np.linspace(0.01, 0.09, 9)), axis=-1)
     top = (lattice.interpolation(points.reshape(-1, 2)) @ moved[-1])[:, 2]
     return float((top.min() - 0.5 * thickness) / thickness - 1)

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from physworld.arrays import Array
 from physworld.check.motion import Change, Proposal
 from physworld.check.run import CheckResult
 from physworld.check.visibility import EffectFigure, ParameterFigure, View
+from physworld.experiments.proposal import rounded
 
 SCHEMA_VERSION = 1
 
@@ -93,9 +93,9 @@ def _proposal(proposal: Proposal) -> dict[str, Any]:
     return {
         "description": proposal.description,
         "motion": proposal.motion,
-        "times_s": _rounded(proposal.times_s),
-        "controllers": _rounded(proposal.controllers),
-        "frame_times_s": _rounded(proposal.frame_times_s),
+        "times_s": rounded(proposal.times_s),
+        "controllers": rounded(proposal.controllers),
+        "frame_times_s": rounded(proposal.frame_times_s),
         "shows": [_change(change) for change in proposal.shows],
         "separates": [_change(change) for change in proposal.separates],
         "tried": proposal.tried,
@@ -114,9 +114,3 @@ def _change(change: Change) -> dict[str, Any]:
 
 def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def _rounded(values: Array) -> list[Any]:
-    """Nested lists to a thousandth of a millimetre or millisecond."""
-    nested: list[Any] = np.round(np.asarray(values, dtype=float), 6).tolist()
-    return nested

@@ -72,10 +72,10 @@ class Experiment:
             "separates": self.separates,
             "description": self.description,
             "motion": self.motion,
-            "times_s": _rounded(self.times_s),
-            "controllers": _rounded(self.controllers),
-            "frame_times_s": _rounded(self.frame_times_s),
-            "difference_m": _rounded(self.difference_m),
+            "times_s": rounded(self.times_s),
+            "controllers": rounded(self.controllers),
+            "frame_times_s": rounded(self.frame_times_s),
+            "difference_m": rounded(self.difference_m),
             "separation_sigmas": float(self.separation_sigmas),
             "recording_sigmas": self.recording_sigmas,
             "tried": self.tried,
@@ -211,7 +211,7 @@ def _otherwise(instead: tuple[str, ...]) -> str:
     return f" Instead: {'; '.join(instead)}." if instead else ""
 
 
-def _rounded(values: Array) -> list[Any]:
-    """Nested lists to a hundredth of a millimetre or millisecond and better."""
+def rounded(values: Array) -> list[Any]:
+    """Nested lists to a thousandth of a millimetre or millisecond."""
     nested: list[Any] = np.round(np.asarray(values, dtype=float), 6).tolist()
     return nested

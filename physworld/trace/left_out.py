@@ -110,7 +110,7 @@ def left_out(linear: Linear, blocks: Sequence[Array], scale: float) -> LeftOut:
     count = len(linear.unknowns)
     normal = sum(normals, np.zeros((count, count))) + prior_slope.T @ prior_slope
     gradient = sum(gradients, np.zeros(count)) + prior_slope.T @ prior_residual
-    gradient[_free(linear)] = 0.0  # what a search has left of it is no fault of the block that is left out
+    gradient[unbound(linear)] = 0.0  # what a search has left of it is no fault of the block that is left out
     weakest = np.diag(_WEAKEST * np.diag(normal) + 1e-30)
     errors = []
     for k, rows in enumerate(blocks):
@@ -120,7 +120,7 @@ def left_out(linear: Linear, blocks: Sequence[Array], scale: float) -> LeftOut:
     return LeftOut(np.array(errors), np.array([len(rows) for rows in blocks]))
 
 
-def _free(linear: Linear) -> Array:
+def unbound(linear: Linear) -> Array:
     """Unknowns that no bound holds, (p,)."""
     if not len(linear.unknowns):
         return np.zeros(0, dtype=bool)

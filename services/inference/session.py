@@ -43,7 +43,16 @@ def strength_told(model: PublishedModel, column: PhiColumn) -> dict[str, Any]:
 
 
 def checked_strength(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> None:
-    """Raises ControlRefused for a strength that is no finite number, or outside of its bounds."""
+    """Refuses a strength that is no finite number, or outside of its bounds.
+
+    Args:
+        name: of the strength.
+        value: that was sent.
+        low, high: its bounds.
+
+    Raises:
+        ControlRefused: with the numbers.
+    """
     if not _is_number(value):
         raise ControlRefused(f"the strength {name!r} is not a finite number")
     if not low <= value <= high:

@@ -17,6 +17,8 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+from physworld_workers.commands.arguments import count_of
+
 SCHEMA_VERSION = 1
 
 
@@ -33,8 +35,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("scene", type=Path, help="folder, archive, final_data.pkl or C3D file")
     parser.add_argument("--json", type=Path, default=None, help="write the figures to this file")
     parser.add_argument("--out", type=Path, default=None, help="folder for the twin and its prediction")
-    parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
-    parser.add_argument("--simulations", type=_count, default=None, help="most simulations of the search")
+    parser.add_argument("--particles", type=count_of, default=None, help="particles of the twin, about")
+    parser.add_argument("--simulations", type=count_of, default=None, help="most simulations of the search")
     parser.add_argument("--law", default=None, help="elastic law by name, or auto: choose it by the data")
     parser.add_argument("--plasticity", default=None, help="flow law by name; its yield is calibrated too")
     parser.add_argument(
@@ -49,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--stages", default="global", help="global, or global+local: a field on top if it holds"
     )
-    parser.add_argument("--processes", type=_count, default=1, help="processes that share the simulations")
+    parser.add_argument("--processes", type=count_of, default=1, help="processes that share the simulations")
     parser.add_argument(
         "--resume",
         type=Path,
@@ -60,13 +62,6 @@ def _parser() -> argparse.ArgumentParser:
         "--quick", action="store_true", help="leave out the runs on finer cells and time steps"
     )
     return parser
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is below 1")
-    return value
 
 
 def _fit(given: argparse.Namespace) -> None:

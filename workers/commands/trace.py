@@ -22,6 +22,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from physworld_workers.commands.arguments import count_of, metres, minutes
+
 PROCESSES = 2
 MINUTES = 10.0
 
@@ -56,50 +58,29 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, default=None, help="write the report to this file")
     parser.add_argument("--predictions", type=Path, default=None, help="npz with the tracks before and after")
     parser.add_argument("--html", type=Path, default=None, help="write the report as a page to this file")
-    parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
+    parser.add_argument("--particles", type=count_of, default=None, help="particles of the twin, about")
     parser.add_argument(
         "--mesh",
         default=None,
         help="of a sheet: the mesh of triangles that recorded it, such as 16x15 or 16x15odd",
     )
-    parser.add_argument("--processes", type=_count, default=PROCESSES, help="processes that simulate")
+    parser.add_argument("--processes", type=count_of, default=PROCESSES, help="processes that simulate")
     parser.add_argument(
         "--time-limit",
-        type=_minutes,
+        type=minutes,
         default=MINUTES,
         metavar="MINUTES",
         help="after about so long searches are left and the answer is made of what there is; 0: never",
     )
     parser.add_argument(
         "--noise",
-        type=_metres,
+        type=metres,
         default=None,
         metavar="METRES",
         help="deviation per axis to take for the noise: how well the experiment repeats, say",
     )
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers every simulation")
     return parser
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is below 1")
-    return value
-
-
-def _minutes(text: str) -> float:
-    value = float(text)
-    if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is no number of minutes")
-    return value
-
-
-def _metres(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is no positive number of metres")
-    return value
 
 
 def _trace(given: argparse.Namespace) -> None:

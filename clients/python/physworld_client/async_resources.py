@@ -81,7 +81,14 @@ class AsyncScenes(AsyncListed):
         kind: str | None = None,
         tag: str | None = None,
     ) -> AsyncListPage[Scene]:
-        """Scenes, newest first: all, those of a kind, those that have a tag."""
+        """Scenes, newest first.
+
+        Args:
+            limit: items of a page.
+            cursor: ``next_cursor`` of the page before; None: the first page.
+            kind: only those of this kind.
+            tag: only those with this tag.
+        """
         return await self._page(
             lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind, tag=tag), cursor
         )

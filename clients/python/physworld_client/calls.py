@@ -135,7 +135,7 @@ def scene_patch(scene_id: str, tags: tuple[str, ...]) -> Call[Scene]:
 def scene_list(
     *, limit: int | None, cursor: str | None, kind: str | None = None, tag: str | None = None
 ) -> Call[Page[Scene]]:
-    """GET /v1/scenes."""
+    """GET /v1/scenes; arguments as of :meth:`physworld_client.resources.Scenes.list`."""
     return Call("GET", "/v1/scenes", _SCENES, query=_given(limit=limit, cursor=cursor, kind=kind, tag=tag))
 
 

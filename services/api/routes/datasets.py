@@ -109,7 +109,7 @@ def export_dataset(
 def export_file(
     dataset_id: str, form: str, points: int | None, database: Database, stores: Stores
 ) -> Response:
-    """A dataset as a file to keep. Raises what ``exports.export`` does."""
+    """A dataset as a file to keep; arguments and errors are those of :func:`export`."""
     pieces = export(dataset_id, form, points, database, stores)
     headers = {"Content-Disposition": f'attachment; filename="{dataset_id}-{form}.zip"'}
     return StreamingResponse(pieces, headers=headers, media_type=ZIP)
