@@ -106,7 +106,11 @@ def bar(frames: int = FRAMES, drag_per_s: float = 0.0) -> Play:
     mesh = make_sample_scene.build_mesh(recipe)
     nodes, weights = elements.weights(np.clip((mesh.vertices - low) / size, 1e-6, 1.0 - 1e-6))
     positions = np.einsum("pk,tpki->tpi", weights, path[:, nodes])
-    truth = {"youngs_modulus_pa": CONVERGED_PA, "air_drag_per_s": drag_per_s}
+    truth = {
+        "youngs_modulus_pa": CONVERGED_PA,
+        "air_drag_per_s": drag_per_s,
+        "note": "these elements bend 1.2 % more stiffly than 16 x 3 x 3 of them do",
+    }
     return _held_beam(Surface(boundary(mesh.tetrahedra), mesh.vertices), positions, truth)
 
 

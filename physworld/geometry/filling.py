@@ -2,11 +2,11 @@
 
 Points that fill a body: an alpha shape, the Delaunay tetrahedra whose circumsphere is no larger than a few point
 distances (Edelsbrunner, Muecke 1994). Strewn points stop short of the surface, so the shape is too small, by 10 to 20 %
-for a few thousand points. It is grown by a share of the distance between points, as large as that is about each place of
-the surface. Which share: where every point stands for the same volume, the tetrahedra around the points deep inside show
-how much that is, and the shape is grown until it holds as much as its points stand for. With few points, or where they lie
-closer in one part than in another, that volume is itself uncertain; then the share is drawn towards the usual one,
-measured on strewn balls, boxes and tori.
+for a few thousand points. It is grown by a share of the distance between points, as large as that is about each place
+of the surface. Which share: where every point stands for the same volume, the tetrahedra around the points deep inside
+show how much that is, and the shape is grown until it holds as much as its points stand for. With few points, or where
+they lie closer in one part than in another, that volume is itself uncertain; then the share is drawn towards the usual
+one, measured on strewn balls, boxes and tori.
 
 Points that only bound a body: a voxel shell that closes around a core; within the shell the planes through neighbouring
 points are the surface. An open surface stays a shell one voxel thick.
