@@ -32,6 +32,17 @@ from physworld.twin.properties import carried
 from physworld.twin.twin import Twin
 
 REFINEMENT = 1.5  # cells of the finer lattice are this many times smaller
+_OTHERS = (
+    1.0,
+    1.1,
+    0.9,
+    1.2,
+    0.8,
+    1.35,
+    0.7,
+    1.5,
+)  # refinements that are tried, over the one that is asked for
+_NEAR = 0.35  # logarithm of the number of particles over the wanted one: close enough
 _STILL = 1e-3  # a free run whose points move less than this share of the body's size is kicked
 _KICK_PER_S = 0.05  # speed of the kick, body sizes a second
 _LEAST_PERIODS = 1.5  # of the dominant mode, to tell its frequency
@@ -189,7 +200,10 @@ def trusted_tracks(
 
 
 def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = REFINEMENT) -> Twin:
-    """The same twin on a lattice whose cells are ``refinement`` times smaller, with the same material points.
+    """The same twin on a lattice whose cells are about ``refinement`` times smaller, with the same material points.
+
+    Cells end at the faces of grips, so that not every size can be had: of some refinements about the one that is asked
+    for, the first whose number of particles is near, or else the nearest.
 
     Args:
         scene: that the twin was built of.
@@ -202,9 +216,22 @@ def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = 
     """
     if not twin.lattice.smooth:
         raise SceneUnsupported(f"{twin.lattice.title} has no finer ones to be asked")
-    finer = build_twin(
-        scene, particle_budget, twin.device, refinement, twin.plasticity, twin.formulation, twin.transfer
-    )
+    wanted = twin.lattice.fill.size * refinement**twin.lattice.dim
+    found: list[tuple[float, Twin]] = []
+    for other in _OTHERS:
+        finer = build_twin(
+            scene,
+            particle_budget,
+            twin.device,
+            refinement * other,
+            twin.plasticity,
+            twin.formulation,
+            twin.transfer,
+        )
+        found.append((abs(float(np.log(finer.lattice.fill.size / wanted))), finer))
+        if found[-1][0] <= _NEAR:
+            break
+    finer = min(found, key=lambda pair: pair[0])[1]
     body = replace(finer.body, points=twin.body.points, offsets=twin.body.offsets)
     return replace(
         finer,

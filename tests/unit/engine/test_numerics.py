@@ -102,3 +102,17 @@ def test_the_dominant_frequency_is_that_of_the_strongest_cosine() -> None:
     assert dominant_frequency(times, times[:, None, None] * np.ones((91, 2, 3))) is None
     for few in (1, 2, 3):  # too short for any frequency
         assert dominant_frequency(times[:few], tracks[:few]) is None
+
+
+def test_cells_that_end_at_a_small_grip_are_refined_all_the_same() -> None:
+    """A grip in the middle of an end leaves few sizes of cells; the one that is asked for is far from what was asked."""
+    scene = swinging_bar()
+    low, high = np.array([-0.1, -0.05, -0.045]), np.array([0.1, 0.05, 0.045])
+    grip = Grip((0, 1, 2, 3), np.array([-0.1, -0.017, -0.015]), np.array([-0.067, 0.017, 0.015]))
+    scene = replace(scene, body=box_body(low, high, density_kg_m3=540.0), grips=(grip,))
+    twin = build_twin(scene, 1000)
+    particles = twin.lattice.fill.size
+    assert build_twin(scene, 1000, refinement=1.4).lattice.fill.size / particles < 0.6 * 1.4**3
+    for factor in (1.4, 1.0 / 1.4):
+        found = refined(scene, twin, 1000, factor).lattice.fill.size
+        assert found / particles == pytest.approx(factor**3, rel=0.42)
