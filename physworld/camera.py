@@ -9,6 +9,8 @@ import numpy as np
 from physworld.arrays import Array
 
 MOST_PIXELS = 4096 * 4096
+USUAL_FOCAL = 1.1
+"""Focal length of cameras in use, in longer sides of the picture."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from physworld.arrays import Array
-from physworld.camera import Camera
+from physworld.camera import USUAL_FOCAL, Camera
 from physworld.errors import TrackingFailed
 from physworld.tracking.markers import DICTIONARIES
 from physworld.tracking.plane import Plane, facing
@@ -25,8 +25,8 @@ from physworld.tracking.view import View, from_opencv
 MOST_LOOKED_AT = 60
 """Frames, spread over the recording."""
 LEAST_CORNERS = 4
-USUAL_FOCAL, FOCAL_SPREAD = 1.1, 0.4
-"""Of cameras in use, in longer sides of the picture, and the spread of its logarithm."""
+FOCAL_SPREAD = 0.4
+"""Of the logarithm of focal lengths of cameras in use."""
 CORNER_PX = 0.3
 """How well a corner is found."""
 MOST_DRIFT_PX = 3.0

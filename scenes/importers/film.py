@@ -1,7 +1,9 @@
 """Films and folders of pictures of one colour camera, one frame at a time.
 
 A film is decoded in the order in which frames are asked for, and again from its beginning where an earlier one is
-asked for: it is never held as a whole. Its moments are those of its frames, which need not be evenly spread.
+asked for: it is never held as a whole. Its moments are those of its frames, which need not be evenly spread. What
+decodes films and straightens pictures is imported where it is used: whoever only tells forms of files apart, as the
+service does, need not have it.
 """
 
 from __future__ import annotations
@@ -12,12 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.camera import MOST_PIXELS, Camera
-from physworld.tracking.boards import USUAL_FOCAL
+from physworld.camera import MOST_PIXELS, USUAL_FOCAL, Camera
 from physworld.tracking.view import View, from_opencv, to_opencv
 from physworld_scenes.errors import refused
 from physworld_scenes.importers.options import FolderImporter
@@ -63,6 +63,8 @@ class Filmed:
         """Where pixels (P, 2) of the pictures as they were taken lie in those of ``view``."""
         if not self.distortion:
             return pixels
+        import cv2
+
         places = np.reshape(to_opencv(pixels), (-1, 1, 2)).astype(np.float64)
         moved = cv2.undistortPoints(places, self.matrix, np.array(self.distortion), None, self.matrix)
         return from_opencv(moved[:, 0])
@@ -147,7 +149,11 @@ def _at_least_two(name: str, all_of_them: list[Any], frames: slice) -> list[Any]
 
 
 def _straightened(picture: Array, matrix: Array, distortion: tuple[float, ...]) -> Array:
-    return cv2.undistort(picture, matrix, np.array(distortion)) if distortion else picture
+    if not distortion:
+        return picture
+    import cv2
+
+    return cv2.undistort(picture, matrix, np.array(distortion))
 
 
 class _Film:
