@@ -105,7 +105,7 @@ def test_the_dominant_frequency_is_that_of_the_strongest_cosine() -> None:
 
 
 def test_cells_that_end_at_a_small_grip_are_refined_all_the_same() -> None:
-    """A grip in the middle of an end leaves few sizes of cells; the one that is asked for is far from what was asked."""
+    """A grip in the middle of an end leaves few sizes of cells to choose from, and the next one may be far away."""
     scene = swinging_bar()
     low, high = np.array([-0.1, -0.05, -0.045]), np.array([0.1, 0.05, 0.045])
     grip = Grip((0, 1, 2, 3), np.array([-0.1, -0.017, -0.015]), np.array([-0.067, 0.017, 0.015]))
