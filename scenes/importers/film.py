@@ -153,7 +153,7 @@ def _straightened(picture: Array, matrix: Array, distortion: tuple[float, ...]) 
         return picture
     import cv2
 
-    return cv2.undistort(picture, matrix, np.array(distortion))
+    return np.asarray(cv2.undistort(picture, matrix, np.array(distortion)))
 
 
 class _Film:
