@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.harness import Report, write_section
 from benchmarks.peers.finite_elements import Acting, Floats
 from benchmarks.trace.folder import CLAIMS, PRIMARY, score, traced
-from benchmarks.trace.hidden_bodies import OBJECTS, TOP_M, Hand
+from benchmarks.trace.hidden_bodies import OBJECTS, TOP_M, Hand, Recorder
 from benchmarks.trace.hidden_kratos import KRATOS
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld_scenes.bundle import write_bundle
@@ -192,6 +192,24 @@ def recording(case: Case) -> tuple[Scene, dict[str, Any]]:
         clean = CubicSpline(fine, recorder.tracks(Acting(gravity_m_s2=GRAVITY), 0.0, fine))(seen_at)
     begun = round(TRAIN_SHARE * FRAMES)
     shown = float(np.sqrt(np.mean((clean - plain)[begun:] ** 2)) / SIGMA_M)
+    strength = "none" if not case.acts else "clear" if shown >= CLEAR else "weak"
+    scene = before_a_camera(case.name, known, recorder, clean, rng)
+    return scene, {"parameters": case.acts, "strength": strength, "signature_sigmas_test": shown}
+
+
+def before_a_camera(
+    name: str, known: Any, recorder: Recorder, clean: Floats, rng: np.random.Generator
+) -> Scene:
+    """The scene that a camera with noise sees, which loses a point now and then.
+
+    Args:
+        name: of the scene.
+        known: the body: what it declares.
+        recorder: its hands, and the points that fill it.
+        clean: points without noise (T, N, 3) [m], ``FPS`` frames a second.
+        rng: of the noise.
+    """
+    times, begun = np.arange(len(clean)) / FPS, round(TRAIN_SHARE * len(clean))
     visible = rng.uniform(size=clean.shape[:2]) > UNSEEN
     visible[0] = True
     points = clean + rng.normal(0.0, SIGMA_M, clean.shape)
@@ -207,16 +225,14 @@ def recording(case: Case) -> tuple[Scene, dict[str, Any]]:
             Grip(tuple(range(first, first + 8)), box[0], box[1], tuple(np.flatnonzero(seen).tolist()))
         )
         first += 8
-    scene = Scene(
-        name=case.name, kind=known.kind, description=f"{case.object} recorded by another engine", points=points,
+    return Scene(
+        name=name, kind=known.kind, description=f"a {known.kind} recorded by another engine", points=points,
         visible=visible, controllers=np.concatenate(controllers, axis=1),
         controller_velocities=np.concatenate(velocities, axis=1), times=times, rest_volume_points=recorder.inside(rng),
-        gravity_m_s2=GRAVITY, noise_sigma_m=SIGMA_M, train=(0, begun), test=(begun, FRAMES),
+        gravity_m_s2=GRAVITY, noise_sigma_m=SIGMA_M, train=(0, begun), test=(begun, len(clean)),
         initial_state=UNDEFORMED_AT_REST, fps=FPS, grips=tuple(grips), declared={}, body=known.body,
         ground=getattr(known, "ground", None),
     )  # fmt: skip
-    strength = "none" if not case.acts else "clear" if shown >= CLEAR else "weak"
-    return scene, {"parameters": case.acts, "strength": strength, "signature_sigmas_test": shown}
 
 
 def _moved(hand: Hand, handle: Floats, time: float) -> Floats:
