@@ -197,7 +197,7 @@ def _report(steps: Mapping[str, Followed], seed: int) -> Report:
             "Empty home, nothing cached: packages are fetched and installed, kernels compiled. `make demo` runs the "
             "shipped beam with the default settings, the notebook with its own small ones.",
             "An emptied environment (new home, new virtual environment, few variables) stands in for a bare machine; "
-            "packages came from an index on the machine itself, so that fetching them costs less than elsewhere.",
+            "packages came from the index that pip is set up with here.",
         ],
         seed=seed,
     )
