@@ -68,10 +68,10 @@ def page(browser: Browser, address: str) -> Iterator[Page]:
 def test_the_search_finds_a_page(page: Page, address: str) -> None:
     page.goto(f"{address}/")
     page.get_by_placeholder("Search").first.click()
-    page.keyboard.type("unpickler")
+    page.keyboard.type("final_data")
     found = page.locator(".md-search-result__item", has_text="PhysTwin").first
     found.locator("a").first.click()
-    expect(page.locator("article")).to_contain_text("unpickler")
+    expect(page.locator("article")).to_contain_text("final_data")
 
 
 def test_a_notebook_shows_its_figures(page: Page, address: str) -> None:
