@@ -150,6 +150,7 @@ def service(data: Path) -> Iterator[Client]:
 def fill(client: Client) -> None:
     """One object of every kind, where there is none yet."""
     beam, rope = (_scene(client, name) for name in (MODEL, "hanging_rope"))
+    client.scenes.update(beam, tags=("sample", "simulated"))
     if not client.keys.list().data[1:]:
         client.keys.create("robot-1", "write", expires_in_days=90)
     if not client.checks.list(limit=1).data:
@@ -167,7 +168,7 @@ def fill(client: Client) -> None:
         longer = SMALL_TRAINING.model_copy(update={"steps": 60})
         _wait(client, client.models.create(MODEL, client.datasets.list(limit=1).data[0].id, longer))
         client.models.set_alias(MODEL, "robot", 1)
-        client.models.update(MODEL, 1, description="For the laboratory's robot", tags=["lab"])
+        client.models.update(MODEL, 1, description="For the laboratory's robot", tags=("lab",))
     if not client.assessments.list(limit=1).data:
         _wait(client, client.assessments.create(MODEL, beam, open_trace=False))
     if not client.traces.list(limit=1).data:

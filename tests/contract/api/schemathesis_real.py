@@ -34,6 +34,8 @@ BODY_IDS = {
 UNNAMED = ("trace_id", "scene_ids", "held_out_scene_ids", "assessment_id", "compared_with", "fit_ids")
 """Keys that have to fit what else a body names; a request without them is right as well."""
 TICKS = 8
+NOT_ALLOWED = 405
+"""All that a method answers which a path does not have; it is no operation."""
 ENDED = "ended-"
 """How the names begin of what is made here to be deleted."""
 
@@ -207,9 +209,10 @@ class Answers:
         """All of them, and the operations that never succeeded."""
         place = os.environ.get(self.variable)
         if place:
-            never = [name for name, seen in self._seen.items() if not any(200 <= one < 300 for one in seen)]
+            there = {name: seen for name, seen in self._seen.items() if set(seen) != {NOT_ALLOWED}}
+            never = [name for name, seen in there.items() if not any(200 <= one < 300 for one in seen)]
             told = {
                 "never": sorted(never),
-                "answers": {name: dict(seen) for name, seen in self._seen.items()},
+                "answers": {name: dict(seen) for name, seen in there.items()},
             }
             Path(place).write_text(json.dumps(told, indent=1))
