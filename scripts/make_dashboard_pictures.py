@@ -36,7 +36,7 @@ from physworld_client.types import (
 )
 from physworld_client.world_model import WorldModel
 from PIL import Image
-from playwright.sync_api import BrowserContext, Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from physworld.video import Drawing, eight_bit, whole_motion_view
 from physworld_scenes.bundle import canonical_archive, read_bundle
@@ -150,6 +150,7 @@ def service(data: Path) -> Iterator[Client]:
 def fill(client: Client) -> None:
     """One object of every kind, where there is none yet."""
     beam, rope = (_scene(client, name) for name in (MODEL, "hanging_rope"))
+    client.scenes.update(beam, tags=("sample", "simulated"))
     if not client.keys.list().data[1:]:
         client.keys.create("robot-1", "write", expires_in_days=90)
     if not client.checks.list(limit=1).data:
@@ -167,7 +168,7 @@ def fill(client: Client) -> None:
         longer = SMALL_TRAINING.model_copy(update={"steps": 60})
         _wait(client, client.models.create(MODEL, client.datasets.list(limit=1).data[0].id, longer))
         client.models.set_alias(MODEL, "robot", 1)
-        client.models.update(MODEL, 1, description="For the laboratory's robot", tags=["lab"])
+        client.models.update(MODEL, 1, description="For the laboratory's robot", tags=("lab",))
     if not client.assessments.list(limit=1).data:
         _wait(client, client.assessments.create(MODEL, beam, open_trace=False))
     if not client.traces.list(limit=1).data:
@@ -209,29 +210,56 @@ def pages(client: Client) -> dict[str, str]:
 
 def take(paths: dict[str, str], base: str, key: str, out: Path) -> int:
     """Write all pictures; the bytes of them all."""
-    chromium = next(
-        (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))),
-        None,
-    )
-    if chromium is None:
-        raise SystemExit("no Chromium on this machine (Debian: apt-get install chromium)")
     total = 0
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=list(FLAGS))
+    with browser() as opened:
         for theme in THEMES:
-            context = browser.new_context(color_scheme=theme)  # type: ignore[arg-type]
+            context = opened.new_context(color_scheme=theme)  # type: ignore[arg-type]
             context.set_default_timeout(60_000)
             page = context.new_page()
             if "login" in paths:
                 total += _both_widths(page, base + paths["login"], out, f"login-{theme}")
-            _log_in(context, page, base, key)
+            log_in(page, base, key)
             for name, path in paths.items():
                 if name != "login":
                     total += _both_widths(page, base + path, out, f"{name}-{theme}")
                     print(f"{name} {theme}", flush=True)
             context.close()
-        browser.close()
     return total
+
+
+@contextmanager
+def browser() -> Iterator[Browser]:
+    """A Chromium that draws 3D views without a graphics card."""
+    chromium = next((path for name in CHROMIUMS if (path := shutil.which(name))), None)
+    if chromium is None:
+        raise SystemExit("no Chromium on this machine (Debian: apt-get install chromium)")
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=chromium, args=list(FLAGS))
+        yield opened
+        opened.close()
+
+
+def log_in(page: Page, base: str, key: str) -> None:
+    """Give the key on the page that asks for one."""
+    page.goto(f"{base}/login")
+    page.fill("#key", key)
+    page.click("button[type=submit]")
+    page.wait_for_selector(".top nav")
+
+
+def show(page: Page, address: str, *, refused: bool) -> None:
+    """Open a page and wait until its views, curves and bodies are there; ``refused``: after a refused upload."""
+    page.goto(address)
+    if refused:
+        _refuse(page)
+    if page.locator("[data-cloud]").count():
+        page.wait_for_selector("[data-cloud][data-ready]")
+    for curve in page.locator("[data-curve]").all():
+        curve.locator(".legend").wait_for()
+    if page.locator("[data-playground]").count():
+        page.wait_for_selector("[data-playground][data-ready][data-accompanied]")
+        page.get_by_label("Twin, live").check()
+        page.locator("[data-twin]", has_text="from the model").wait_for()
 
 
 def _scene(client: Client, name: str) -> str:
@@ -289,13 +317,6 @@ def _film(client: Client, scene_id: str) -> None:
     _wait(client, client.videos.create("fit", fit.id))
 
 
-def _log_in(context: BrowserContext, page: Page, base: str, key: str) -> None:
-    page.goto(f"{base}/login")
-    page.fill("#key", key)
-    page.click("button[type=submit]")
-    page.wait_for_selector(".top nav")
-
-
 def _refuse(page: Page) -> None:
     """What the form of the page answers to a file that is no recording, sent as a browser without scripts sends it."""
     page.set_input_files(
@@ -309,17 +330,7 @@ def _both_widths(page: Page, address: str, out: Path, name: str) -> int:
     total = 0
     for width in WIDTHS_PX:
         page.set_viewport_size({"width": width, "height": 900})
-        page.goto(address)
-        if name.startswith("upload-refused"):
-            _refuse(page)
-        if page.locator("[data-cloud]").count():
-            page.wait_for_selector("[data-cloud][data-ready]")
-        for curve in page.locator("[data-curve]").all():
-            curve.locator(".legend").wait_for()
-        if page.locator("[data-playground]").count():
-            page.wait_for_selector("[data-playground][data-ready][data-accompanied]")
-            page.get_by_label("Twin, live").check()
-            page.locator("[data-twin]", has_text="from the model").wait_for()
+        show(page, address, refused=name.startswith("upload-refused"))
         page.wait_for_timeout(1e3 * DRAWN_S)
         for _ in range(2):  # what is as high as a share of the window grows with it
             height = min(TALLEST_PX, int(page.evaluate("document.documentElement.scrollHeight")))

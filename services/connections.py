@@ -47,10 +47,13 @@ class Connection(H11Protocol):
         self._watch()
 
     def data_received(self, data: bytes) -> None:
-        """Take data in, and see what is waited for now."""
+        """Take data in, and see what is waited for now; nothing where it opened a WebSocket."""
         self._received += len(data)
         super().data_received(data)
-        self._watch()
+        if self.transport.get_protocol() is self:
+            self._watch()
+        else:
+            self._rest()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Nothing is waited for any more."""

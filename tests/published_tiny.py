@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -80,14 +81,20 @@ def publish_tiny(
     card: dict[str, Any] | None = None,
     changed: dict[str, Callable[[np.ndarray], np.ndarray]] | None = None,
     weights: bytes | None = None,
+    hidden: int | None = None,
 ) -> tuple[str, int]:
     """Register scene, fit and model; the model's name and version.
 
     ``kind``: of the thing; ``dragged``: as of ``tiny_model``; ``acting``: an effect of the twin beside the model, with
     its strengths; ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more of its
-    card; ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all.
+    card; ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all; ``hidden``: a
+    measured point that the recording sees in its first frame only.
     """
     scene, twin, model = tiny_model(kind, dragged)
+    if hidden is not None:
+        visible = scene.visible.copy()
+        visible[1:, hidden] = False
+        scene = replace(scene, visible=visible)
     twin = twin if acting is None else twin.with_effect(effect(acting[0], **acting[1]))
     scene_id = register(scene, database, artifacts)
     buffer = io.BytesIO()

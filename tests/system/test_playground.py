@@ -355,3 +355,10 @@ def green(page: Page) -> int:
     picture = page.locator("[data-playground] canvas").screenshot()
     colours = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
     return int(((colours[..., 1] > 150) & (colours[..., 0] < 100) & (colours[..., 2] < 110)).sum())
+
+
+def test_a_point_that_the_recording_lost_is_left_out(served: Served, page: Page) -> None:
+    name, version = publish_tiny(served.database, served.stores.artifacts, name="lost-point", hidden=0)
+    enter(dataclasses.replace(served, model=name, version=version), page)
+    expect(page.get_by_label("Recording", exact=True)).to_be_checked()
+    page.wait_for_timeout(500)  # some frames are drawn; the fixture asks for the errors of the page

@@ -52,6 +52,10 @@ def before_call(context: HookContext, case: Case, kwargs: dict[str, object]) -> 
     ending = real.ends.get((case.method.upper(), case.path))
     if ending is not None:
         case.path_parameters.update(ending() or {})
+    elif case.path == "/v1/loops/{loop_id}":
+        case.path_parameters["loop_id"] = real.looped()
+    elif case.path.endswith("/compare"):
+        case.path_parameters["name"], case.query = real.compared()
     elif case.path_parameters and case.method.upper() != "DELETE":
         _name_what_is_there(case, real)
     if case.path.endswith("/aliases/{alias}") and case.method.upper() == "PUT":

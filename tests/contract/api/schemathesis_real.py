@@ -34,6 +34,8 @@ BODY_IDS = {
 UNNAMED = ("trace_id", "scene_ids", "held_out_scene_ids", "assessment_id", "compared_with", "fit_ids")
 """Keys that have to fit what else a body names; a request without them is right as well."""
 TICKS = 8
+NOT_ALLOWED = 405
+"""All that a method answers which a path does not have; it is no operation."""
 ENDED = "ended-"
 """How the names begin of what is made here to be deleted."""
 
@@ -118,13 +120,27 @@ class Real:
 
     def plan(self) -> dict[str, Any]:
         """A plan that brings the first point somewhere near."""
-        goal = {"kind": "points", "points": {"index": [0], "places": [[0.05, 0.0, 0.05]]}}
+        goal = {"kind": "points", "index": [0], "places": [[0.05, 0.0, 0.05]]}
         return {"model": self._model()[0], "goal": goal}
 
     def loop(self) -> dict[str, Any]:
         """A loop of a model and another recording of its object."""
         model, scene = self._model()
         return {"model": model, "scene_id": self.uploaded(scene)}
+
+    def looped(self) -> str:
+        """Id of a loop, which is its job's: one of those that are there, or a new one that is cancelled at once."""
+        if self.listed("/v1/loops"):
+            return self.one("/v1/loops")
+        job = self._posted("/v1/loops", self.loop())
+        self._posted(f"/v1/jobs/{job.get('id')}/cancel", {})
+        return str(job.get("id", "none"))
+
+    def compared(self) -> tuple[str, dict[str, str]]:
+        """A model and two of its ready versions; where it has one, that twice."""
+        name, _ = self._model()
+        ready = self.listed(f"/v1/models/{name}/versions?state=ready", "version") or ["latest"]
+        return name, {one: self._random.choice(ready) for one in "ab"}
 
     def uploaded(self, scene: str | None = None) -> str:
         """A new scene: a known recording under another name."""
@@ -133,8 +149,9 @@ class Real:
         return str(made.json().get("id", "none"))
 
     def _model(self) -> tuple[str, str]:
-        """A model and the scene that it was made of."""
-        name = self.one("/v1/models", "name")
+        """A model with a ready version, and the scene that it was made of."""
+        models = self._client.get("/v1/models?limit=100").json().get("data", [])
+        name = self._random.choice([str(one["name"]) for one in models if one["latest"]] or ["none"])
         version = self._client.get(f"/v1/models/{name}/versions/latest").json()
         return name, version.get("scene_id") or self.one("/v1/scenes")
 
@@ -192,9 +209,10 @@ class Answers:
         """All of them, and the operations that never succeeded."""
         place = os.environ.get(self.variable)
         if place:
-            never = [name for name, seen in self._seen.items() if not any(200 <= one < 300 for one in seen)]
+            there = {name: seen for name, seen in self._seen.items() if set(seen) != {NOT_ALLOWED}}
+            never = [name for name, seen in there.items() if not any(200 <= one < 300 for one in seen)]
             told = {
                 "never": sorted(never),
-                "answers": {name: dict(seen) for name, seen in self._seen.items()},
+                "answers": {name: dict(seen) for name, seen in there.items()},
             }
             Path(place).write_text(json.dumps(told, indent=1))

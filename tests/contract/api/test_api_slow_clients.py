@@ -12,6 +12,10 @@ from pathlib import Path
 import httpx
 import pytest
 import uvicorn
+from starlette.applications import Starlette
+from starlette.routing import WebSocketRoute
+from starlette.websockets import WebSocket
+from websockets.sync.client import connect
 
 from physworld_services import connections
 from physworld_services.web import create_app
@@ -108,3 +112,29 @@ def test_both_servers_of_the_web_process_are_so_patient() -> None:
     folder = Path(__file__).parents[3] / "services"
     for name in ("web.py", "embedded/web.py"):
         assert "http=Connection" in (folder / name).read_text()
+
+
+async def _answer_each(socket: WebSocket) -> None:
+    await socket.accept()
+    async for text in socket.iter_text():
+        await socket.send_text(text)
+
+
+def test_a_websocket_that_is_open_for_longer_is_no_body_that_does_not_come(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connections, "BODY_S", PATIENCE_S)
+    app = Starlette(routes=[WebSocketRoute("/", _answer_each)])
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        config = uvicorn.Config(app, http=connections.Connection, ws=connections.Session, log_config=None)
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+        thread.start()
+        while not server.started:
+            time.sleep(0.02)
+        with connect(f"ws://127.0.0.1:{listening.getsockname()[1]}/", proxy=None) as client:
+            time.sleep(3 * PATIENCE_S)
+            client.send("still here")
+            assert client.recv(timeout=WITHIN_S) == "still here"
+        server.should_exit = True
+        thread.join()

@@ -9,7 +9,7 @@ import {
   BufferAttribute, BufferGeometry, DynamicDrawUsage, LineBasicMaterial, LineSegments, Points, Vector3,
 } from "three";
 import { colour, onSchemeChange } from "./palette.js";
-import { roundPoints, segments } from "./points.js";
+import { keepVisible, roundPoints, segments } from "./points.js";
 import { bodyOf } from "./surface.js";
 import { View } from "./view.js";
 
@@ -52,16 +52,7 @@ class Layer {
     if (!this.points.visible) return;
     const size = this.spec.count * 3;
     const source = this.values.subarray(frame * size, (frame + 1) * size);
-    const target = this.attribute.array;
-    let used = 0;
-    for (let i = 0; i < size; i += 3) {
-      if (Number.isNaN(source[i])) continue;
-      target[used] = source[i];
-      target[used + 1] = source[i + 1];
-      target[used + 2] = source[i + 2];
-      used += 3;
-    }
-    this.geometry.setDrawRange(0, used / 3);
+    this.geometry.setDrawRange(0, keepVisible(source, this.attribute.array));
     this.attribute.needsUpdate = true;
   }
 }

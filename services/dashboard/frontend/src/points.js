@@ -75,6 +75,19 @@ export function segments(ends) {
   return new LineSegments(geometry, new LineBasicMaterial());
 }
 
+/** Copies the points of a frame that are visible, those without NaN, into a buffer; how many they are. */
+export function keepVisible(values, target) {
+  let used = 0;
+  for (let i = 0; i < values.length; i += 3) {
+    if (Number.isNaN(values[i])) continue;
+    target[used] = values[i];
+    target[used + 1] = values[i + 1];
+    target[used + 2] = values[i + 2];
+    used += 3;
+  }
+  return used / 3;
+}
+
 /** Round points of one colour, whose places are set from a frame. */
 export class Cloud {
   constructor(count, role, size, opacity = 1) {
@@ -93,7 +106,7 @@ export class Cloud {
   }
 
   set(values) {
-    this.attribute.array.set(values);
+    this.points.geometry.setDrawRange(0, keepVisible(values, this.attribute.array));
     this.attribute.needsUpdate = true;
   }
 }
