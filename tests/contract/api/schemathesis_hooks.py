@@ -27,6 +27,8 @@ SHARE = 0.8
 """Of the requests that are meant to be right, those that ask for what is there."""
 WHOLE = {"/v1/rollouts": Real.rollout, "/v1/plans": Real.plan, "/v1/loops": Real.loop}
 """Bodies that have to fit a model: half of the requests take these."""
+FULL = (("/tracks", "/v1/traces", "?state=ready"), ("/episodes/", "/v1/datasets", "?state=sealed"))
+"""Parts of paths that only such items of a listing have."""
 _SERVICES: dict[str, Real] = {}
 _RANDOM = random.Random(0)
 _ANSWERS = Answers()
@@ -108,10 +110,8 @@ def _name_what_is_there(case: Case, real: Real) -> None:
                 return
             if parameter in case.path_parameters and path.endswith("/pictures"):
                 return
-            known = real.listed(
-                f"{path}?state=ready" if case.path.endswith("/tracks") else path,
-                "id" if parameter.endswith("_id") else parameter,
-            )
+            state = next((state for part, of, state in FULL if part in case.path and path == of), "")
+            known = real.listed(path + state, "id" if parameter.endswith("_id") else parameter)
             if not known:
                 return
             part = case.path_parameters[parameter] = _RANDOM.choice(known)
