@@ -29,6 +29,8 @@ PARTS = (
     "/report",
     "/surface",
     "/ghost",
+    "/splat",
+    "/export/",
 )
 ELSEWHERE = {"/fits/*", "/checks/*", "/videos/*", "/videos/*/*"}  # films, or lead to what they belong to
 MOST_BYTES = 6_000_000
