@@ -12,6 +12,7 @@ import os
 import queue
 import subprocess
 import sys
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -118,6 +119,7 @@ class _Parser:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
+        self._end: weakref.finalize[[subprocess.Popen[str]], _Parser] | None = None
 
     def ask(self, request: dict[str, Any]) -> dict[str, Any]:
         """The answer to a request; a process that is gone is replaced once."""
@@ -143,14 +145,10 @@ class _Parser:
         )
 
     def close(self) -> None:
-        """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            for pipe in (self._process.stdin, self._process.stdout):
-                if pipe is not None:
-                    pipe.close()
-            self._process = None
+        """End the process, as happens too where nobody has this parser any more."""
+        if self._end is not None:
+            self._end()
+        self._process = self._end = None
 
     def _running(self) -> subprocess.Popen[str]:
         if self._process is None or self._process.poll() is not None:
@@ -164,4 +162,13 @@ class _Parser:
                 stdout=subprocess.PIPE,
                 text=True,
             )
+            self._end = weakref.finalize(self, _ended, self._process)
         return self._process
+
+
+def _ended(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            pipe.close()

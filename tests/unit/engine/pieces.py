@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.verification.contact import in_pieces, laid, still
+from benchmarks.verification.cases import hold as still
+from benchmarks.verification.contact import in_pieces, laid
 from physworld.engine.lattice.lattice import Lattice
 
 __all__ = ["crossings", "in_pieces", "laid", "still"]
