@@ -82,7 +82,7 @@ class Report:
         command = machine.get("command", f"benchmarks.{self.name}")
         return (
             f"`python -m {command}`; {machine['cpu']}, {machine['cores']} cores, "
-            f"load {machine['load']:.1f} at the start; Python {machine['python']}, {versions}; seed {self.seed}; "
+            f"load {machine['load']:.1f} at the end; Python {machine['python']}, {versions}; seed {self.seed}; "
             f"{machine['date']}"
         )
 

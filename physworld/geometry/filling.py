@@ -112,9 +112,8 @@ def filled_body(points: Array) -> FilledBody:
     share = np.zeros(len(points))
     np.add.at(share, mesh.simplices, np.repeat(volumes[:, None] / 4.0, 4, axis=1))
     own, count = share[deep], len(points)
-    uneven = (
-        _mean_about(points[deep], own, points[deep]).var() - 2.0 * own.var() / _FEW
-    )  # twice what chance gives
+    by_chance = own.var() / _FEW
+    uneven = _mean_about(points[deep], own, points[deep]).var() - 2.0 * by_chance
     error = float(np.sqrt(own.var() / len(own) + max(float(uneven), 0.0)))
     return _grown(shape, points, (count * float(own.mean()), count * error))
 

@@ -108,7 +108,9 @@ def test_randomly_strewn_points_stand_for_their_whole_volume(name: str, count: i
 def test_a_few_points_grow_by_the_usual_amount() -> None:
     cloud = np.random.default_rng(0).uniform(0, 1, size=(40, 3))
     body = filled_body(cloud)
-    assert 0.05 < body.reach_m < 0.14
+    assert body.growth == pytest.approx(
+        0.31
+    )  # of the distance between points, as on strewn balls, boxes and tori
     assert np.prod(np.ptp(cloud, axis=0)) * 0.6 < body.volume_m3 < 1.3
 
 

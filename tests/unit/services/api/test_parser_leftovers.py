@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import subprocess
@@ -11,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.service.hostile_files.corpus import Corpus, sound_bundle
-from physworld_services.api.parsing import ROOT
+from physworld_scenes.errors import SceneInvalid
+from physworld_services.api.parsing import ROOT, Parsers
 
 pytestmark = pytest.mark.slow
 
@@ -50,3 +52,15 @@ def test_a_reader_leaves_its_files_in_the_uploads_folder(tmp_path: Path, dies: b
     assert json.loads(ended.stdout)["outcome"] == ("crashed" if dies else "read")
     assert len(list(folder.glob("**/*.c3d"))) == dies
     assert list(temporary.iterdir()) == []
+
+
+def test_a_reader_that_nobody_holds_any_more_ends(tmp_path: Path) -> None:
+    (tmp_path / "upload").write_bytes(b"no recording")
+    parsers = Parsers(1)
+    with pytest.raises(SceneInvalid):
+        parsers.look(tmp_path, "some.npz", {})
+    process = parsers._idle.queue[0]._process
+    assert process is not None and process.poll() is None
+    del parsers
+    gc.collect()
+    assert process.poll() is not None
