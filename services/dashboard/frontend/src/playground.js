@@ -233,6 +233,7 @@ class Playground {
       this.twin.take(tick, values.subarray(0, size));
       return;
     }
+    const heard = number !== this.acknowledged; // for the first time: later frames of the same control tell no delay
     this.acknowledged = number;
     this.twin.follow(tick, values.subarray(0, size));
     this.latest = values.subarray(0, size);
@@ -245,7 +246,7 @@ class Playground {
     this.handles.set(this.places.flatMap((place) => place.toArray()));
     this.frames += 1;
     const sent = this.sentAt.get(number);
-    if (sent !== undefined) {
+    if (heard && sent !== undefined) {
       this.delay = now - sent.at;
       for (const old of this.sentAt.keys()) if (old < number) this.sentAt.delete(old);
     }
