@@ -241,7 +241,9 @@ def test_the_recorded_motion_is_driven_beside_the_recording(served: Served, page
     assert wanted > 2e-3
     # what was sent last is drawn when its answer has come
     until(page, lambda: np.linalg.norm(place(page, "grip") - recorded) < 0.25 * wanted)
-    page.wait_for_timeout(1000)  # every answer has come: no more is waited for, and the delay stays what it was
+    page.wait_for_timeout(
+        1000
+    )  # every answer has come: no more is waited for, and the delay stays what it was
     delay = page.evaluate("() => window.playgrounds[0].delay")
     page.wait_for_timeout(500)
     assert page.evaluate("() => window.playgrounds[0].delay") == delay
