@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import pytest
-from conftest import Work
 from sqlalchemy import select
 
 from physworld_schemas.base import Page
@@ -17,6 +17,9 @@ from physworld_storage.database import Database
 from physworld_storage.family import ancestors, family_of, related
 from physworld_storage.jobs import jobs
 from physworld_storage.tables import FitRow, ModelVersionRow
+
+if TYPE_CHECKING:
+    from conftest import Work
 
 
 @pytest.fixture
