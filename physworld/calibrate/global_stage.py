@@ -50,6 +50,7 @@ from physworld.calibrate.parameters import (
     hangs_taut,
     parameters_of,
     relaxing,
+    release,
 )
 from physworld.calibrate.rods import calibrate_rod
 from physworld.calibrate.search import Progress, Search
@@ -243,6 +244,7 @@ def searched_parameters(scene: Scene, twin: Twin, config: CalibrationConfig) -> 
         ground_friction=scene.ground is not None and scene.ground.friction is None,
         taut=hangs_taut(scene, twin),
     )
+    found += release(twin, scene.times[: scene.train[1]])
     if config.damping == "auto":
         found += relaxing(twin, scene.times[: scene.train[1]])
     return found if config.bending == "auto" else [p for p in found if p.stage != "shape"]

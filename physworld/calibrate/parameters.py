@@ -67,6 +67,8 @@ _WEAVE_BOUNDS = {"weft_ratio": (0.05, 20.0), "shear_ratio": (0.003, 5.0), "bendi
 _FIBRES_GAIN = 0.1  # share of the training cost, of fibres
 _FRICTION_BOUNDS = (0.02, 3.0)
 RELAXING_SHARE = "relaxing_share"
+RELEASE_DELAY = "release_delay_s"
+_LONGEST_RELEASE_S = 0.1  # of a hand that opens
 _RELAXING_GAIN = 0.1  # share of the training cost, of stiffness that fades
 _MOST_BRANCHES = 5  # of one decade each
 _NEVER_PA = 1e12  # a yield stress that nothing reaches
@@ -168,6 +170,22 @@ def relaxing(twin: Twin, times: Array) -> list[Parameter]:
     return [
         Parameter(RELAXING_SHARE, "1", 1e-3, 1.0, apply, step=0.1, starts=(0.04,), stage="optional",
                   least_gain=_RELAXING_GAIN)
+    ]  # fmt: skip
+
+
+def release(twin: Twin, times: Array) -> list[Parameter]:
+    """How long after its first motion a body that somebody held swings freely: fingers open in some frames.
+
+    Args:
+        twin: the twin to calibrate.
+        times: of the frames [s], (T,).
+    """
+    if twin.release_s == 0.0 or twin.natural is not None:
+        return []
+    frame = float(np.median(np.diff(times)))
+    return [
+        Parameter(RELEASE_DELAY, "s", -min(2 * frame, 0.9 * twin.release_s), max(5 * frame, _LONGEST_RELEASE_S),
+                  _set(RELEASE_DELAY), transform=LINEAR, step=0.25 * frame, starts=(frame,), stage="optional")
     ]  # fmt: skip
 
 

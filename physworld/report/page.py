@@ -176,7 +176,7 @@ def _effects(report: dict[str, Any]) -> Html | None:
     calibrated = report.get("calibrated", {})
     parts: list[Child] = []
     if rows:
-        parts.append(_table(("effect", "", "number", "value", "95 % interval", ""), rows))
+        parts.append(_table(("effect", "role", "number", "value", "95 % interval", "drawn"), rows))
     if calibrated:
         entries = [
             tag("tr", tag("td", label(name)), *_figure(figure)) for name, figure in calibrated.items()
@@ -184,7 +184,7 @@ def _effects(report: dict[str, Any]) -> Html | None:
         title = "Calibrated with it" if rows else "Calibrated parameters"
         parts += [
             tag("h3", title) if rows else None,
-            _table(("parameter", "value", "95 % interval", ""), entries),
+            _table(("parameter", "value", "95 % interval", "drawn"), entries),
         ]
     if not parts:
         return None

@@ -35,6 +35,7 @@ def arrays_of(twin: Twin) -> dict[str, Array]:
         "ground_height_m": twin.ground_height_m,
         "ground_friction": twin.ground_friction,
         "release_s": twin.release_s,
+        "release_delay_s": twin.release_delay_s,
         "grip_softness": twin.grip_softness,
         "grip_regions": [None if region is None else region.tolist() for region in twin.grip_regions],
         "thickness_m": body.thickness_m,
@@ -95,6 +96,7 @@ def parts_of(arrays: dict[str, Array]) -> dict[str, Any]:
         "held_nodes": tuple(np.array(h, dtype=int) for h in facts["held"]),
         "controllers_start": arrays["controllers_start"],
         "release_s": facts["release_s"],
+        "release_delay_s": facts.get("release_delay_s", 0.0),
         "grip_softness": facts.get("grip_softness", 0.0),
         "grip_regions": tuple(
             None if region is None else np.array(region) for region in facts.get("grip_regions", ())

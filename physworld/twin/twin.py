@@ -61,6 +61,7 @@ class Twin:
         held_nodes: nodes that each grip holds, one array a group.
         controllers_start: controllers at the first frame [m], (K, 3).
         release_s: the body is held at its start until then (somebody let go of it).
+        release_delay_s: how much of that is later than the recording shows the first motion.
         grip_softness: of a solid, cells over which a grip's hold sets in (:mod:`physworld.engine.terms.soft_grips`); 0:
         every
             node that gripped material touches is prescribed. Total Lagrangian only.
@@ -90,6 +91,7 @@ class Twin:
     held_nodes: tuple[Array, ...]
     controllers_start: Array
     release_s: float = 0.0
+    release_delay_s: float = 0.0
     grip_softness: float = 0.0
     grip_regions: tuple[Array | None, ...] = ()
     turning: tuple[int, ...] = ()
@@ -150,12 +152,14 @@ class Twin:
             values["ground_friction"] = self.ground_friction
         if self.self_friction is not None:
             values["self_friction"] = self.self_friction
+        if self.release_s > 0.0:
+            values["release_delay_s"] = self.release_delay_s
         return values
 
     def with_parameters(self, **values: float) -> Twin:
         """A twin with other parameters; names are those of :attr:`parameters`. Raises KeyError for an unknown one."""
         law_names = {f.name for f in fields(self.law)}
-        own = {"air_drag_per_s", "ground_friction", "self_friction"} & set(self.parameters)
+        own = {"air_drag_per_s", "ground_friction", "self_friction", "release_delay_s"} & set(self.parameters)
         flow_names = set() if self.plasticity is None else {f.name for f in fields(self.plasticity)}
         unknown = set(values) - law_names - own - flow_names
         if unknown:
@@ -163,6 +167,8 @@ class Twin:
         own_values: dict[str, Any] = {k: float(v) for k, v in values.items() if k in own}
         law_values: dict[str, Any] = {k: float(v) for k, v in values.items() if k in law_names}
         flow_values: dict[str, Any] = {k: float(v) for k, v in values.items() if k in flow_names}
+        if "release_delay_s" in own_values:
+            own_values["release_s"] = self.release_s + own_values["release_delay_s"] - self.release_delay_s
         law = replace(self.law, **law_values)
         flow = self.plasticity
         if flow is not None:

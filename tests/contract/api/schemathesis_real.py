@@ -71,6 +71,10 @@ class Real:
             )
         self.ends["DELETE", "/v1/assessments/{assessment_id}"] = self._assessment
 
+    def close(self) -> None:
+        """Give its connections back."""
+        self._client.close()
+
     def listed(self, path: str, key: str = "id") -> list[str]:
         """How paths name what the collection at ``path`` has."""
         at, known = self._listed.get(path, (0.0, []))

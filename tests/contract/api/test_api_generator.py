@@ -25,7 +25,9 @@ def real(service: Service) -> Iterator[Real]:
         assert client.post("/v1/models", json={"name": MODEL, **training}).status_code == 202
         service.work()
         assert client.post("/v1/models", json={"name": "untrained", **training}).status_code == 202
-    yield Real(service.url, service.token("admin"))
+    real = Real(service.url, service.token("admin"))
+    yield real
+    real.close()
 
 
 @pytest.mark.parametrize("path", ["/v1/plans", "/v1/loops"])
