@@ -184,8 +184,8 @@ def release(twin: Twin, times: Array) -> list[Parameter]:
         return []
     frame = float(np.median(np.diff(times)))
     return [
-        Parameter(RELEASE_DELAY, "s", -min(2 * frame, 0.9 * twin.release_s), max(5 * frame, _LONGEST_RELEASE_S),
-                  _set(RELEASE_DELAY), transform=LINEAR, step=0.25 * frame, starts=(frame,), stage="optional")
+        Parameter(RELEASE_DELAY, "s", -2 * frame, max(5 * frame, _LONGEST_RELEASE_S),
+                  _delayed, transform=LINEAR, step=0.25 * frame, starts=(frame,), stage="optional")
     ]  # fmt: skip
 
 
@@ -390,6 +390,11 @@ def _positive(name: str, unit: str, low: float, high: float, start: float) -> Pa
 
 def _set(name: str) -> Callable[[Twin, float], Twin]:
     return lambda twin, value: twin.with_parameters(**{name: value})
+
+
+def _delayed(twin: Twin, delay_s: float) -> Twin:
+    """Of several recordings some may show no release."""
+    return twin if twin.release_s == 0.0 else twin.with_parameters(release_delay_s=delay_s)
 
 
 def _sheet_modulus(thickness: float) -> Callable[[Twin, float], Twin]:

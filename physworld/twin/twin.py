@@ -45,6 +45,7 @@ from physworld.twin.rods import sections_of
 Progress = Callable[[int, int], None]
 
 _SMOOTHING = 1e-9  # against particle positions: felt only by what particles do not see
+_EARLIEST_RELEASE_S = 1e-6  # after the first frame, of a body that was held
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,9 @@ class Twin:
         law_values: dict[str, Any] = {k: float(v) for k, v in values.items() if k in law_names}
         flow_values: dict[str, Any] = {k: float(v) for k, v in values.items() if k in flow_names}
         if "release_delay_s" in own_values:
-            own_values["release_s"] = self.release_s + own_values["release_delay_s"] - self.release_delay_s
+            seen = self.release_s - self.release_delay_s
+            own_values["release_delay_s"] = max(own_values["release_delay_s"], _EARLIEST_RELEASE_S - seen)
+            own_values["release_s"] = seen + own_values["release_delay_s"]
         law = replace(self.law, **law_values)
         flow = self.plasticity
         if flow is not None:

@@ -50,3 +50,12 @@ def test_a_body_that_nobody_held_has_no_delay(let_go: Scene) -> None:
     free = replace(build_twin(let_go, BUDGET), release_s=0.0)
     assert release(free, let_go.times) == []
     assert RELEASE_DELAY not in free.parameters
+
+
+def test_an_early_release_stays_one_and_free_bodies_stay_free(let_go: Scene) -> None:
+    twin = build_twin(let_go, BUDGET)
+    (delay,) = release(twin, let_go.times)
+    assert delay.apply(replace(twin, release_s=0.0), 0.02).release_s == 0.0
+    early = delay.apply(replace(twin, release_s=0.01), -1.0)
+    assert early.release_s == pytest.approx(1e-6)
+    assert delay.apply(early, 0.0).release_s == pytest.approx(0.01)
