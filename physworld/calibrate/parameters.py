@@ -48,6 +48,7 @@ from physworld.materials.transversely_isotropic import TransverselyIsotropic
 from physworld.scene import Scene
 from physworld.twin.twin import Twin
 
+BENDING, STRETCHING = "bending_n_m2", "stretching_n"  # E I and E A of a rope
 TWIST_RATIO = "bending_twist_ratio"
 BENDING_RATIO = "bending_ratio"  # D over K h^2 / 12
 BENDING_COUPLING = "bending_coupling"
@@ -136,7 +137,7 @@ def parameters_of(
                       stage="optional", held=prior)
         )  # fmt: skip
     return [
-        *_stiffness(twin, separate_bending),
+        *_stiffness(twin, separate_bending, taut),
         *(_stretching(twin) if taut else ()),
         *_torsion(twin),
         *_twist(twin),
@@ -232,7 +233,7 @@ def _stretching(twin: Twin) -> list[Parameter]:
         law.stretching_n * 2.0**power for power in (0, -1, 1, -2, 2, -3, -4)
     )  # its phase slips in between
     return [
-        Parameter("stretching_n", "N", low, high, _set("stretching_n"), step=0.05, starts=starts, stage="taut",
+        Parameter(STRETCHING, "N", low, high, _set(STRETCHING), step=0.05, starts=starts, stage="taut",
                   held=law.stretching_n)
     ]  # fmt: skip
 
@@ -341,7 +342,7 @@ def _flow(twin: Twin) -> list[Parameter]:
     ]  # fmt: skip
 
 
-def _stiffness(twin: Twin, separate_bending: bool) -> list[Parameter]:
+def _stiffness(twin: Twin, separate_bending: bool, taut: bool) -> list[Parameter]:
     law, density = twin.law, twin.density
     length = float(np.ptp(twin.body.start, axis=0).max())
     if isinstance(law, SolidLaw):
@@ -371,8 +372,10 @@ def _stiffness(twin: Twin, separate_bending: bool) -> list[Parameter]:
     if not isinstance(law, RodLaw):
         raise TypeError(f"no parameters for {type(law).__name__}")
     unit = density * 9.81 * length**3
+    tube = 0.5 * law.stretching_n * twin.body.thickness_m**2  # E I of a hollow section with this E A
+    high = max(unit, _STRETCHING_BOUNDS[1] * tube) if taut else unit
     return [
-        Parameter("bending_n_m2", "N m^2", 1e-6 * unit, unit, _set("bending_n_m2"), step=0.05,
+        Parameter(BENDING, "N m^2", 1e-6 * unit, high, _set(BENDING), step=0.05,
                   starts=tuple(unit * f for f in (1e-4, 1e-3, 1e-2, 1e-1)), stage="stiffness"),
     ]  # fmt: skip
 

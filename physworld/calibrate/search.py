@@ -27,6 +27,7 @@ from physworld.calibrate.descents import (
     measured_together,
 )
 from physworld.calibrate.parameters import Parameter
+from physworld.calibrate.taut import taut_starts
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import Descent as LeastSquares
@@ -134,21 +135,22 @@ class Search:
     def scan(self, parameters: list[Parameter]) -> Optimum:
         """Multi-start over the starts of the first parameter and of a flow law's, then on all training frames.
 
-        Of a taut rope over those of its stretching instead, and over the others' from the best of these.
+        Of a taut rope over those of its section instead (:func:`~physworld.calibrate.taut.taut_starts`), and over the
+        others' from the best of these, of which one is kept: what is followed differs in stiffness.
         """
         window = self.first_window()
-        first = "taut" if any(p.stage == "taut" for p in parameters) else "flow"
-        tried = [p.starts if k == 0 or p.stage == first else p.starts[:1] for k, p in enumerate(parameters)]
+        taut = any(p.stage == "taut" for p in parameters)
+        tried = [p.starts if k == 0 or p.stage == "flow" else p.starts[:1] for k, p in enumerate(parameters)]
         starts = [
             np.array([p.searched(value) for p, value in zip(parameters, values, strict=True)])
-            for values in product(*tried)
+            for values in (taut_starts(self.twin, parameters) if taut else product(*tried))
         ]
         usable = self._usable("scan", parameters, starts, window)
         for k, own in enumerate(parameters):
-            if usable and own.stage == "flow" != first:
+            if usable and taut and own.stage == "flow":
                 best, here = np.array(usable[0][1]), np.arange(len(parameters)) == k
                 others = [np.where(here, own.searched(value), best) for value in own.starts[1:]]
-                usable = sorted(usable + self._usable(f"scan {own.name}", parameters, others, window))
+                usable[0] = min([usable[0], *self._usable(f"scan {own.name}", parameters, others, window)])
         if not usable:
             raise CalibrationError(
                 f"none of {len(starts)} starts with {parameters[0].name} from {parameters[0].starts[0]:.3g} to "
