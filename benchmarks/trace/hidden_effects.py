@@ -28,7 +28,7 @@ from benchmarks.peers.finite_elements import Acting, Floats
 from benchmarks.trace.folder import CLAIMS, PRIMARY, score, traced
 from benchmarks.trace.hidden_bodies import OBJECTS, TOP_M, Hand, Recorder
 from benchmarks.trace.hidden_kratos import KRATOS
-from benchmarks.trace.hidden_solids import SOLIDS
+from benchmarks.trace.hidden_solids import SOLIDS, NotConvergedError
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld_scenes.bundle import write_bundle
 
@@ -364,7 +364,12 @@ def main() -> int:
         for case in SETS[given.set]():
             if given.only and case.name not in given.only:
                 continue
-            scene = _made(case, given.scenes or Path(folder, "made"))
+            try:
+                scene = _made(case, given.scenes or Path(folder, "made"))
+            except NotConvergedError as refused:
+                print(f"{case.name} is refused: {refused}", file=sys.stderr, flush=True)
+                failed = True
+                continue
             report = traced(scene, Path(folder), given.resume, given.processes, given.time_limit)
             failed |= report is None
             if report is not None:

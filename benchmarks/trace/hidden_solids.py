@@ -2,11 +2,16 @@
 
 Lumps in a small grip, thick bars, slabs that hang by two corners. Each is recorded on fine cells, and again on coarse
 ones with twice the step: where the two differ by more than a third of the camera's noise the recording is refused.
+
+``python -m benchmarks.trace.hidden_solids BODY SEED`` says what the step alone changes, what the cells change, and how
+much of that a stiffness takes up, to choose cells by.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import argparse
+import sys
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +25,7 @@ if TYPE_CHECKING:
     from benchmarks.peers.kratos_solids import Solid
 
 ALLOWED_M = 1e-3 / 3.0  # a third of the noise, root mean square per axis on the frames where it is largest
+_STIFFER = 0.02  # for what a stiffness changes, to first order
 Lines = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 
 
@@ -126,3 +132,38 @@ SOLIDS: dict[str, Converged] = {
         fine=(_FIFTHS, (0.0, 1.0), _FIFTHS), coarse=(_even(5), (0.0, 1.0), _even(5)), step_s=1.3e-4,
     ),
 }  # fmt: skip
+
+
+def main() -> int:
+    """Print what step and cells change in one recording without an effect."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.trace.hidden_solids", description=__doc__)
+    parser.add_argument("body", choices=sorted(SOLIDS))
+    parser.add_argument("seed", type=int)
+    given = parser.parse_args()
+    body = SOLIDS[given.body]
+    times = np.arange(body.frames) / 30.0
+
+    def recorded(other: Converged) -> Floats:
+        rough = other.recorder(given.seed, np.random.default_rng(900 + given.seed)).rough
+        assert rough is not None
+        return rough(Acting(), 0.0, times)
+
+    coarse = recorded(body)
+    step = recorded(replace(body, step_s=0.5 * body.step_s))
+    print(f"half the step changes coarse cells by {1e3 * largest_change_m(step, coarse):.3f} mm", flush=True)
+    fine = recorded(replace(body, coarse=body.fine, step_s=0.5 * body.step_s))
+    print(f"fine cells change it by {1e3 * largest_change_m(fine, step):.3f} mm", flush=True)
+    stiffer = recorded(replace(body, young_pa=(1.0 + _STIFFER) * body.young_pa))
+    share, left = without_stiffness(fine - step, (stiffer - coarse) / _STIFFER)
+    print(f"as {share:+.1%} of stiffness, but for {1e3 * largest_change_m(left, np.zeros_like(left)):.3f} mm")
+    return 0
+
+
+def without_stiffness(change: Floats, by_stiffness: Floats) -> tuple[float, Floats]:
+    """The share of stiffness that is nearest to a change (T, N, 3) [m], to first order, and what it leaves of it."""
+    share = float(np.sum(change * by_stiffness) / np.sum(by_stiffness**2))
+    return share, change - share * by_stiffness
+
+
+if __name__ == "__main__":
+    sys.exit(main())

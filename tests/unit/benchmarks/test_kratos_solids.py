@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.peers.finite_elements import Acting
+from benchmarks.trace import hidden_effects
 from benchmarks.trace.hidden_effects import solid_cases
-from benchmarks.trace.hidden_solids import ALLOWED_M, SOLIDS, NotConvergedError, largest_change_m
+from benchmarks.trace.hidden_solids import (
+    ALLOWED_M,
+    SOLIDS,
+    NotConvergedError,
+    largest_change_m,
+    without_stiffness,
+)
 
 pytest.importorskip("KratosMultiphysics", reason="Kratos comes with the extra bench")
 from benchmarks.peers.kratos_solids import Solid
@@ -78,3 +87,25 @@ def test_the_change_is_that_of_the_worst_frame() -> None:
 def test_half_of_the_recordings_have_no_effect() -> None:
     cases = solid_cases()
     assert sum(not case.acts for case in cases) * 2 == len(cases)
+
+
+def test_what_a_stiffness_does_not_take_up_is_left() -> None:
+    by, rest = np.zeros((2, 2, 3)), np.zeros((2, 2, 3))
+    by[0], rest[1] = 1.0, 0.5
+    share, left = without_stiffness(0.03 * by + rest, by)
+    assert share == pytest.approx(0.03)
+    assert left == pytest.approx(rest)
+
+
+def test_a_refused_recording_is_not_traced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def refused(case: object, folder: Path) -> Path:
+        raise NotConvergedError("coarser cells change it by 8.06 mm")
+
+    monkeypatch.setattr(hidden_effects, "_made", refused)
+    monkeypatch.setattr(hidden_effects, "traced", lambda *_: pytest.fail("it was traced"))
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        ["hidden_effects", "--set", "hidden_solids", "--only", "s01", "--json", str(tmp_path / "rows.json")],
+    )
+    assert hidden_effects.main() == 1
