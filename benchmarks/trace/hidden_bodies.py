@@ -63,11 +63,13 @@ class Recorder:
         hands: its grips.
         tracks: points (T, N, 3) [m] of what acts, of hands that follow so late [s], at evenly spaced times (T,) [s].
         inside: points that fill the body at rest, (M, 3) [m], drawn from a generator.
+        rough: as ``tracks``, cheaper and less right, to tell by how much an effect shows; None: ``tracks`` tells.
     """
 
     hands: list[Hand]
     tracks: Callable[[Acting, float, Floats], Floats]
     inside: Callable[[np.random.Generator], Floats]
+    rough: Callable[[Acting, float, Floats], Floats] | None = None
 
 
 @dataclass(frozen=True)
