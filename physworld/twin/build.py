@@ -252,8 +252,6 @@ def _release_time(scene: Scene) -> float:
 
 def taken_over(twin: Twin, other: Twin) -> Twin:
     """``other``'s body, start and grips with the parameters and effects of ``twin``."""
-    if other.release_s > 0.0:
-        other = other.with_parameters(release_delay_s=twin.release_delay_s)
     return replace(
         other,
         natural=twin.natural if other.natural is not None else None,
