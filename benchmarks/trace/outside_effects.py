@@ -15,6 +15,7 @@ import warp as wp
 from scipy.interpolate import PchipInterpolator
 
 from physworld.effects.base import Effect, Strength
+from physworld.effects.places import body_size, middle_of_free_end
 from physworld.effects.registry import EFFECTS
 from physworld.engine.problem import Problem
 from physworld.engine.terms.term import BoundTerm
@@ -22,7 +23,7 @@ from physworld.engine.terms.term import BoundTerm
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
 
-_SLOW_M_S = 0.02  # speed below which dry friction is a viscous one
+_BESIDE = 0.01  # body sizes from the body at the start to a wall
 _ALWAYS = (-1.0, 1e9)
 
 
@@ -32,29 +33,32 @@ def push_from_outside(
     mass: wp.array(dtype=wp.float64),
     times: wp.array(dtype=wp.float64),
     push: wp.vec3d,
-    spin: wp.vec3d,
-    centre: wp.vec3d,
     window: wp.vec2d,
     pace: wp.float64,
-    rub: wp.float64,
-    slow: wp.float64,
+    magnet: wp.float64,
+    centre: wp.vec3d,
+    wall: wp.float64,
+    stiff: wp.float64,
     clock: wp.array(dtype=wp.float64),
     counter: wp.array(dtype=wp.int32),
     # in
     x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
     # out
     force: wp.array(dtype=wp.float64),
 ):
-    """Add m (push cos(pace t) + spin x (place - centre) - rub v / |v|) at one node, within the window."""
+    """Add m (push cos(pace t) + magnet (centre - place) / |centre - place|^3 + a wall's push) at one node, within the
+    window."""
     node = wp.tid()
     time = times[counter[0]] + wp.float64(counter[1]) * clock[2]
     if time < window[0] or time >= window[1]:
         return
-    place = wp.vec3d(x[3 * node], x[3 * node + 1], x[3 * node + 2])
-    velocity = wp.vec3d(v[3 * node], v[3 * node + 1], v[3 * node + 2])
-    speed = wp.sqrt(wp.dot(velocity, velocity) + slow * slow)
-    pull = wp.cos(pace * time) * push + wp.cross(spin, place - centre) - (rub / speed) * velocity
+    way = centre - wp.vec3d(x[3 * node], x[3 * node + 1], x[3 * node + 2])
+    far = wp.length(way)
+    pull = wp.cos(pace * time) * push
+    if magnet > wp.float64(0.0):
+        pull += (magnet / (far * far * far)) * way
+    if wall > x[3 * node + 1]:
+        pull += wp.vec3d(wp.float64(0.0), stiff * (wall - x[3 * node + 1]), wp.float64(0.0))
     for i in range(3):
         force[3 * node + i] += mass[node] * pull[i]
 
@@ -64,16 +68,17 @@ class Push:
     """Term of the forces below: what acts on every kilogram [m/s^2], and when."""
 
     push: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    spin_per_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     window_s: tuple[float, float] = _ALWAYS
     pace_rad_s: float = 0.0
-    rub_m_s2: float = 0.0
+    magnet_m3_s2: float = 0.0
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    wall_per_s2: float = 0.0
+    wall_y_m: float = -np.inf
 
     def bind(self, problem: Problem) -> BoundPush:
         """Device arrays."""
         mass = wp.array(problem.nodal_mass(), dtype=wp.float64, device=problem.device)
-        return BoundPush(self, mass, self.rub_m_s2 / _SLOW_M_S)
+        return BoundPush(self, mass, float(np.sqrt(self.wall_per_s2)))
 
 
 @dataclass
@@ -82,7 +87,7 @@ class BoundPush(BoundTerm):
 
     law: Push
     mass: wp.array
-    friction_per_s: float
+    frequency_rad_s: float
     times: wp.array | None = None
 
     def begin(self, times: np.ndarray) -> None:
@@ -93,9 +98,9 @@ class BoundPush(BoundTerm):
         """Add the forces [N]."""
         law = self.law
         inputs = [
-            self.mass, self.times, wp.vec3d(*law.push), wp.vec3d(*law.spin_per_s2), wp.vec3d(*law.centre),
-            wp.vec2d(*law.window_s), wp.float64(law.pace_rad_s), wp.float64(law.rub_m_s2), wp.float64(_SLOW_M_S),
-            clock, counter, x, v,
+            self.mass, self.times, wp.vec3d(*law.push), wp.vec2d(*law.window_s), wp.float64(law.pace_rad_s),
+            wp.float64(law.magnet_m3_s2), wp.vec3d(*law.centre), wp.float64(law.wall_y_m), wp.float64(law.wall_per_s2),
+            clock, counter, x,
         ]  # fmt: skip
         wp.launch(
             push_from_outside, dim=len(self.mass), inputs=inputs, outputs=[force], device=self.mass.device
@@ -154,32 +159,35 @@ class Shaking(Outside):
 
 
 @dataclass(frozen=True)
-class Swirl(Outside):
-    """A steady field of force that goes round an axis."""
+class Magnet(Outside):
+    """A point beside the body that draws all of it, the more the nearer."""
 
-    name = "swirl"
-    title = "a swirl"
-    equation = "a = size k x (x - c)"
-    unit = "1/s^2"
-    probe = 1.0
+    name = "magnet"
+    title = "a magnet"
+    equation = "a = size (c - x) / |c - x|^3"
+    unit = "m^3/s^2"
+    probe = 1e-3
 
     def term(self, twin: Twin) -> Push:
-        """Round a slanting axis through the body's middle."""
-        x, y, z = twin.particles_start[twin.particle_mass > 0].mean(axis=0)
-        return Push(spin_per_s2=(0.6 * self.size, 0.0, 0.8 * self.size), centre=(x, y, z))
+        """Half a body's size beside its free end."""
+        x, y, z = middle_of_free_end(twin) + 0.5 * body_size(twin) * np.array([0.36, 0.8, -0.48])
+        return Push(magnet_m3_s2=self.size, centre=(x, y, z))
 
 
 @dataclass(frozen=True)
-class DryFriction(Outside):
-    """Drag that does not depend on speed."""
+class Wall(Outside):
+    """A smooth, soft wall close beside the body."""
 
-    name = "dry_friction"
-    title = "friction of a constant force"
-    equation = "a = -size v / |v|"
+    name = "wall"
+    title = "a wall in the way"
+    equation = "a = size max(w - y, 0) along y, w a hundredth of the body's size beside it"
+    unit = "1/s^2"
+    probe = 10.0
 
     def term(self, twin: Twin) -> Push:
-        """Viscous where it is slow."""
-        return Push(rub_m_s2=self.size)
+        """On the side of -y."""
+        beside = float(twin.particles_start[:, 1].min()) - _BESIDE * body_size(twin)
+        return Push(wall_per_s2=self.size, wall_y_m=beside)
 
 
 @dataclass(frozen=True)
@@ -208,7 +216,7 @@ class RollingShutter(Outside):
         return seen
 
 
-OUTSIDE: tuple[type[Outside], ...] = (Gust, Shaking, Swirl, DryFriction, RollingShutter)
+OUTSIDE: tuple[type[Outside], ...] = (Gust, Shaking, Magnet, Wall, RollingShutter)
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from physworld.effects.anisotropy import Anisotropy
 from physworld.effects.base import Effect
 from physworld.effects.buoyancy import Buoyancy
 from physworld.effects.clamp_offset import ClampOffset
+from physworld.effects.dry_friction import DryFriction
 from physworld.effects.gravity_tilt import GravityTilt
 from physworld.effects.grip_slip import GripSlip
 from physworld.effects.ground_friction import GroundFriction
@@ -35,6 +36,7 @@ from physworld.effects.region_force import RegionForce
 from physworld.effects.rest_shape import RestShape
 from physworld.effects.stiffness_field import StiffnessField
 from physworld.effects.strain_stiffening import StrainStiffening
+from physworld.effects.swirl import Swirl
 from physworld.effects.tether import Tether
 from physworld.effects.time_varying_stiffness import TimeVaryingStiffness
 from physworld.effects.viscoelastic_maxwell import ViscoelasticMaxwell
@@ -52,6 +54,7 @@ _BUILT_IN: tuple[type[Effect], ...] = (
     AirDragLinear,
     AirDragQuadratic,
     AirDragAcross,
+    DryFriction,
     InternalFriction,
     ViscosityKelvinVoigt,
     ViscoelasticMaxwell,
@@ -60,6 +63,7 @@ _BUILT_IN: tuple[type[Effect], ...] = (
     Plasticity,
     Tether,
     RegionForce,
+    Swirl,
     GroundFriction,
     Adhesion,
     ActuationLag,

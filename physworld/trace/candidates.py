@@ -7,7 +7,7 @@ refit then frees the shape of the best.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from physworld.effects.base import Mirror, Shape, Strength
 from physworld.effects.registry import EFFECTS
@@ -57,12 +57,7 @@ class Candidate:
 
     def unknowns(self) -> list[Unknown]:
         """The gates, in units of their probes; with what is known of them beforehand."""
-        return [
-            of_strength(self.effect, gate)
-            if gate.prior_deviation is None
-            else replace(of_strength(self.effect, gate), prior=(0.0, gate.prior_deviation / gate.probe))
-            for gate in self.gates
-        ]
+        return [of_strength(self.effect, gate, spread=gate.prior_deviation) for gate in self.gates]
 
     def shape_unknowns(self) -> list[Unknown]:
         """The shapes that a refit frees, from where the variant has them."""

@@ -25,7 +25,7 @@ from physworld.trace.screening import Screened, screened
 from physworld.trace.starts import NO_WORSE, Begun, Starts, distinct, elsewhere
 
 _VARIANTS = 3  # shapes of an effect that are begun before its best is freed
-WORTH = 0.1  # share of the error above the noise that an effect removes to first order, to be fitted
+WORTH = 0.1  # share of the error near the noise that an effect removes to first order, to be fitted
 _QUIET = 1.2  # misfit over the noise up to which what is left is small, and calibrated numbers are right
 _HALF = 0.5  # of what the best one promises: what a rival has to promise to be fitted to all frames
 _FIRST_OF_TWO = 0.29  # share of the root mean square that goes with one of two effects of the same size
@@ -164,7 +164,8 @@ class Search:
         by_effect: dict[str, list[Screened]] = {}
         for one in scores:
             by_effect.setdefault(one.candidate.effect, []).append(one)
-        order = [own for own in by_effect.values() if own[0].share > WORTH][:count]
+        # far from the noise a score to first order ranks, but says little of what a fit would remove
+        order = [own for own in by_effect.values() if own[0].share > WORTH or not _near(base)][:count]
         if not base.members:
             # a score to first order says nothing of an effect that is large
             order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]

@@ -89,7 +89,7 @@ class Starts:
         """
         design = self._designed(base, one, int(_DESIGN * share))
         unknowns, places, errors = self._ranked(base, one, [*self._near(base, one, basins), *design])
-        twin, _ = self.setting.assembled((*base.members, one.candidate), base.values, bool(base.members))
+        twin, _ = self.setting.assembled((*base.members, one.candidate), base.values)
         white, frames = self.early
         first = [u.name for u in unknowns].index(self.setting.calibrated[0].name)
         fits: list[tuple[float, Values]] = []
@@ -120,7 +120,7 @@ class Starts:
     ) -> tuple[list[Unknown], list[Array], list[float]]:
         """Unknowns, places (p,) of the starts, and mean squared residuals of each on the early frames."""
         members = (*base.members, one.candidate)
-        twin, unknowns = self.setting.assembled(members, base.values, shapes=bool(base.members))
+        twin, unknowns = self.setting.assembled(members, base.values)
         low, high = bounds_of(unknowns)
         places = [np.clip([start.get(u.name, u.start) for u in unknowns], low, high) for start in starts]
         runs = self.setting.simulations.run(

@@ -57,16 +57,23 @@ def _value(twin: Twin, parameter: Parameter) -> float:
     raise KeyError(f"the twin has no {parameter.name}; it has {sorted(known)}")
 
 
-def of_strength(effect: str, strength: Strength, scale: float | None = None, start: float = 0.0) -> Unknown:
-    """A strength in units of ``scale`` (its probe unless given), from ``start``.
+def of_strength(
+    effect: str,
+    strength: Strength,
+    step: float | None = None,
+    start: float = 0.0,
+    spread: float | None = None,
+) -> Unknown:
+    """A strength in units of its probe, whether it is calibrated or an effect's.
 
     Args:
         effect: name in the registry.
         strength: as the effect declares it.
-        scale: unit of the search, in the strength's unit.
-        start: in the strength's unit.
+        step: of finite differences, in the strength's unit as what follows; None for its probe.
+        start: where a search begins.
+        spread: deviation about zero of what is known beforehand; None if nothing is.
     """
-    unit = strength.probe if scale is None else scale
+    unit = strength.probe
     return Unknown(
         f"{effect}.{strength.name}",
         strength.unit,
@@ -74,7 +81,9 @@ def of_strength(effect: str, strength: Strength, scale: float | None = None, sta
         strength.high,
         lambda twin, value: with_strengths(twin, effect, {strength.name: value}),
         multiple_of(unit),
+        step=1.0 if step is None else step / unit,
         start=start / unit,
+        prior=None if spread is None else (0.0, spread / unit),
     )
 
 
@@ -89,8 +98,7 @@ def clamp_reach(twin: Twin) -> Unknown | None:
     cell = max(float(twin.lattice.spacing.max()), 2.0 * twin.body.half_thickness_m)
     reach = next(s for s in clamp.strengths(twin) if s.name == "reach_m")
     known = replace(reach, low=max(reach.low, -cell), high=min(reach.high, cell))
-    unknown = of_strength(CLAMP, known, _CLAMP_STEP * cell)
-    return replace(unknown, prior=(0.0, _CLAMP_SPREAD / _CLAMP_STEP))
+    return of_strength(CLAMP, known, _CLAMP_STEP * cell, spread=_CLAMP_SPREAD * cell)
 
 
 def grip_softness(twin: Twin) -> Unknown | None:
@@ -124,9 +132,8 @@ def grip_compliance(twin: Twin) -> Unknown | None:
         return None
     sheared = twin.body.thickness_m**2 / (1.2 * float(np.sqrt(twin.law.bending_n_m2 * weight)))
     known = next(s for s in slip.strengths(twin) if s.name == "compliance_m_n")
-    scale = _SLIP_STEP * sheared
-    unknown = of_strength(SLIP, replace(known, high=sheared), scale)
-    return replace(unknown, start=1.0, prior=(0.0, 1.0 / _SLIP_STEP))
+    step = _SLIP_STEP * sheared
+    return of_strength(SLIP, replace(known, high=sheared), step, start=step, spread=sheared)
 
 
 def hold_unknowns(twin: Twin) -> list[Unknown]:

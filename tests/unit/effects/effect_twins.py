@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 from made_scene import FPS, box_body, made_scene
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
+from physworld.effects.dry_friction import SLOW_M_S
 from physworld.engine.problem import nodal_mass
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.twin.build import build_twin
@@ -96,4 +99,21 @@ def centroid(twin: Twin, nodes: np.ndarray) -> np.ndarray:
     return centre - centre[0]
 
 
-__all__ = ["FPS", "FRAMES", "SCENES", "TWINS", "centroid", "loose", "moved", "simulated"]
+def rubbed_fall(times: np.ndarray, size: float) -> np.ndarray:
+    """Height (T,) [m] of what falls from rest against a dry friction [m/s^2]."""
+    return solve_ivp(
+        lambda _, y: [y[1], -9.81 - size * y[1] / np.hypot(y[1], SLOW_M_S)],
+        (0.0, times[-1]), (0.0, 0.0), t_eval=times, rtol=1e-10, atol=1e-12,
+    ).y[0]  # fmt: skip
+
+
+def swirled(times: np.ndarray, spin: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Way (T, 3) [m] of what begins at rest ``off`` (3,) [m] the axis of a swirl (3,) [1/s^2]: x'' = s x (x - c)."""
+    rates = np.zeros((6, 6))
+    rates[:3, 3:], rates[3:, :3] = np.eye(3), np.cross(spin, np.eye(3)).T
+    return np.array([(expm(rates * t) @ np.concatenate([off, np.zeros(3)]))[:3] - off for t in times])
+
+
+__all__ = [
+    "FPS", "FRAMES", "SCENES", "TWINS", "centroid", "loose", "moved", "rubbed_fall", "simulated", "swirled",
+]  # fmt: skip

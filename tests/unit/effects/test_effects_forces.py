@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from effect_twins import SCENES, centroid, loose, moved
+from effect_twins import SCENES, centroid, loose, moved, rubbed_fall, swirled
 from scipy.spatial.transform import Rotation
 
 from physworld.effects.registry import effect
@@ -48,6 +48,27 @@ def test_quadratic_drag_gives_the_terminal_velocity(name: str) -> None:
     fall = flown(name, effect("air_drag_quadratic", coefficient_per_m=coefficient), gravity=GRAVITY)[:, 2]
     expected = -np.log(np.cosh(np.sqrt(9.81 * coefficient) * TIMES)) / coefficient
     np.testing.assert_allclose(fall, expected, atol=FLIGHT * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_dry_friction_slows_a_fall_by_the_same_at_every_speed(name: str) -> None:
+    size = 4.0
+    fall = flown(name, effect("dry_friction", size_m_s2=size), gravity=GRAVITY)[:, 2]
+    law = rubbed_fall(TIMES, size)
+    np.testing.assert_allclose(fall, law, atol=FLIGHT * np.abs(law).max())
+    assert abs(law[-1] + 0.5 * (9.81 - size) * TIMES[-1] ** 2) < 0.02 * abs(law[-1])
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_swirl_carries_the_centre_of_mass_about_its_axis(name: str) -> None:
+    spin, off = np.array([2.0, -1.0, 3.0]), np.array([0.2, -0.1, 0.05])
+    middle = centre_of_mass(loose(name))
+    given = {f"spin_{a}_per_s2": s for a, s in zip("xyz", spin, strict=True)}
+    given |= {f"centre_{a}_m": c for a, c in zip("xyz", middle - off, strict=True)}
+    expected = swirled(TIMES, spin, off)
+    np.testing.assert_allclose(
+        flown(name, effect("swirl", **given)), expected, atol=FLIGHT * np.abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import warp as wp
-from effect_twins import SCENES, TWINS, moved, simulated
+from effect_twins import SCENES, TWINS, moved, rubbed_fall, simulated, swirled
 from same_numbers import assert_same
 
 from physworld.effects.base import Effect
@@ -107,6 +107,24 @@ def test_quadratic_drag_gives_the_terminal_velocity() -> None:
     fall = way(free(GRAVITY).with_effect(effect("air_drag_quadratic", coefficient_per_m=6.0)))[:, 2]
     expected = -np.log(np.cosh(np.sqrt(9.81 * 6.0) * TIMES)) / 6.0
     np.testing.assert_allclose(fall, expected, atol=FLIGHT * np.abs(expected).max())
+
+
+def test_dry_friction_slows_a_fall_by_the_same_at_every_speed() -> None:
+    fall = way(free(GRAVITY).with_effect(effect("dry_friction", size_m_s2=4.0)))[:, 2]
+    expected = rubbed_fall(TIMES, 4.0)
+    np.testing.assert_allclose(fall, expected, atol=FLIGHT * np.abs(expected).max())
+
+
+def test_a_swirl_carries_the_centre_of_mass_about_its_axis() -> None:
+    spin, off = np.array([2.0, -1.0, 3.0]), np.array([0.2, -0.1, 0.05])
+    twin = free()
+    middle = np.average(twin.particles_start, axis=0, weights=twin.particle_mass)
+    given = {f"spin_{a}_per_s2": s for a, s in zip("xyz", spin, strict=True)}
+    given |= {f"centre_{a}_m": c for a, c in zip("xyz", middle - off, strict=True)}
+    expected = swirled(TIMES, spin, off)
+    np.testing.assert_allclose(
+        way(twin.with_effect(effect("swirl", **given))), expected, atol=FLIGHT * np.abs(expected).max()
+    )
 
 
 def test_wind_and_linear_drag_carry_a_body_to_the_winds_velocity() -> None:
