@@ -27,7 +27,6 @@ class AirDragAcross(Effect):
     equation = "a = -b |v_n| v_n"
     kind = "force"
     gates = ("coefficient_per_m",)
-    scanned = True
 
     coefficient_per_m: float = 0.0
 

@@ -25,7 +25,6 @@ class AirDragLinear(Effect):
     equation = "a = -c v"
     kind = "force"
     gates = ("rate_per_s",)
-    scanned = True
 
     rate_per_s: float = 0.0
 

@@ -77,7 +77,6 @@ class AirDragQuadratic(Effect):
     equation = "a = -k |v| v"
     kind = "force"
     gates = ("coefficient_per_m",)
-    scanned = True
 
     coefficient_per_m: float = 0.0
 

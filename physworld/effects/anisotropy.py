@@ -55,7 +55,6 @@ class Anisotropy(Effect):
     kind = "stress"
     gates = ("ratio",)
     strains = True
-    scanned = True  # fibres so stiff that nothing about them is small
 
     ratio: float = 0.0
     azimuth_rad: float = 0.0

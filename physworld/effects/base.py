@@ -80,8 +80,6 @@ class Effect:
         kind: where it enters.
         gates: fields whose zero switches the effect off.
         strains: acts on the strains of a body's cells, which a mesh of triangles does not have.
-        scanned: a score to first order may miss the effect, since it may be large, or since without it a stiffness far
-            from the truth fits (a body that rings down, and takes energy): a trace looks over its whole range.
         contains: effects that this one is, with some of its strengths at zero; its others have to earn their place
             beside them.
         instead: a measurement that settles whether the effect is there without a motion of the grips, for people.
@@ -93,7 +91,6 @@ class Effect:
     kind: ClassVar[Kind]
     gates: ClassVar[tuple[str, ...]]
     strains: ClassVar[bool] = False
-    scanned: ClassVar[bool] = False
     contains: ClassVar[tuple[str, ...]] = ()
     instead: ClassVar[str | None] = None
 

@@ -84,7 +84,6 @@ class DryFriction(Effect):
     equation = "a = -d v / sqrt(|v|^2 + v0^2)"
     kind = "force"
     gates = ("size_m_s2",)
-    scanned = True
 
     size_m_s2: float = 0.0
 

@@ -30,7 +30,6 @@ class InternalFriction(Effect):
     equation = "M += B k_f z, k_o z' = k' - |k'| z"
     kind = "stress"
     gates = ("moment_per_m",)
-    scanned = True
 
     moment_per_m: float = 0.0
     onset_per_m: float = 1.0

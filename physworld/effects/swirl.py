@@ -107,9 +107,13 @@ class Swirl(Effect):
 
     @classmethod
     def variants(cls, twin: Twin) -> list[Variant]:
-        """About the body's middle; a refit finds where the axis is."""
-        middle = {f"centre_{a}_m": float(c) for a, c in zip("xyz", _middle(twin), strict=True)}
-        return [Variant(cls.gates, "", middle, tuple(middle))]
+        """About the body's middle: about another axis it is this and a push, which has names of its own."""
+        return [
+            Variant(
+                cls.gates,
+                fixed={f"centre_{a}_m": float(c) for a, c in zip("xyz", _middle(twin), strict=True)},
+            )
+        ]
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds the term."""

@@ -91,7 +91,6 @@ class ViscoelasticMaxwell(Effect):
     kind = "stress"
     gates = ("shear_modulus_pa", "share")
     strains = True
-    scanned = True
 
     shear_modulus_pa: float = 0.0
     share: float = 0.0

@@ -34,7 +34,6 @@ class ViscosityKelvinVoigt(Effect):
     equation = "sigma += 2 eta d"
     kind = "stress"
     gates = ("viscosity_pa_s", "relaxation_s")
-    scanned = True
 
     viscosity_pa_s: float = 0.0
     relaxation_s: float = 0.0

@@ -46,11 +46,6 @@ class Candidate:
         return self.effect if not self.variant else f"{self.effect} ({self.variant})"
 
     @property
-    def scanned(self) -> bool:
-        """Whether a score to first order may miss the effect, so that it is looked for over its whole range."""
-        return EFFECTS[self.effect].scanned
-
-    @property
     def contains(self) -> tuple[str, ...]:
         """Effects that it is with some strengths at zero."""
         return EFFECTS[self.effect].contains

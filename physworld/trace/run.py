@@ -167,7 +167,7 @@ class _Trace:
         declared = self._declared(ground)
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
-        starts = Starts(setting, early_part(ground.bare, self.split), config.seed)
+        starts = Starts(setting, early_part(ground.bare, self.split))
         sizes = (config.confirmed, config.additions, config.effects_at_most)
         search = Search(setting, chosen, starts, *sizes, config.seed)
         self.clock.start()

@@ -164,11 +164,13 @@ class Search:
         by_effect: dict[str, list[Screened]] = {}
         for one in scores:
             by_effect.setdefault(one.candidate.effect, []).append(one)
-        # far from the noise a score to first order ranks, but says little of what a fit would remove
-        order = [own for own in by_effect.values() if own[0].share > WORTH or not _near(base)][:count]
-        if not base.members:
-            # a score to first order says nothing of an effect that is large
-            order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
+        order = list(by_effect.values())
+        if _near(base):
+            order = [own for own in order if own[0].share > WORTH]
+        if (
+            _near(base) or base.members
+        ):  # else a score to first order says little of an effect, which may be large
+            order = order[:count]
         simpler = [name for own in order for name in own[0].candidate.contains]
         return order + [
             by_effect[name] for name in simpler if name in by_effect and by_effect[name] not in order
@@ -179,6 +181,9 @@ class Search:
         are small differences; else those that promise at least half of what the best one does."""
         begun = [self._begun(base, own, far) for own in order]
         most = max((one.promised for one in begun), default=0.0)
+        if far:
+            begun = [self.starts.followed(base, one, one.promised >= _HALF * most) for one in begun]
+            most = max((one.promised for one in begun), default=0.0)
         scored = max((one.screened.share for one in begun), default=0.0)
         for one in sorted(begun, key=lambda one: -one.promised):
             known = self.hypotheses.get(_names((*base.members, one.screened.candidate)))
@@ -197,12 +202,7 @@ class Search:
         first = self.setting.calibrated[0].name
         other = distinct([h.values.get(first, 0.0) for h in best], [base.values.get(first, 0.0)])
         others = [best[k] for k in other][:_BASINS]
-        begun = [
-            self.starts.far(base, one, others, 1.0 / len(kept))
-            if far
-            else self.starts.near(base, one, others)
-            for one in kept
-        ]
+        begun = [self.starts.begun(base, one, others, far / len(kept)) for one in kept]
         return max(begun, key=lambda one: one.promised)
 
     def _settle(self, size: int) -> None:

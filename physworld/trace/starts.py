@@ -1,9 +1,9 @@
 """Where fits of a hypothesis begin.
 
 *Near* starts are the linear estimate of the strengths, multiples of it (a strength is underestimated where motion has
-run out of phase), and both where other hypotheses have come to rest (their *basins*). *Far* starts are a
-low-discrepancy design over strengths, stiffness and whatever else nothing is known of. All are ranked on the first part
-of the recording, where phases have not slipped yet; the best of the far ones are first fitted to that part.
+run out of phase), and both where other hypotheses have come to rest (their *basins*). *Far* starts are estimates of the
+strengths beside other stiffnesses. All are ranked on the first part of the recording, where phases have not slipped
+yet; the best of the far ones are first fitted to that part.
 """
 
 from __future__ import annotations
@@ -12,24 +12,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import qmc
 
 from physworld.arrays import Array
 from physworld.calibrate.parameters import BENDING_RATIO, TWIST_RATIO
 from physworld.estimation.noise import Split
 from physworld.estimation.refit import refit
 from physworld.estimation.simulations import Job
-from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at
+from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at, starts_of
 from physworld.estimation.whitening import ScaledWhitener, Whitener
 from physworld.trace.hypotheses import Hypothesis, Setting, Values
 from physworld.trace.posterior import removes
 from physworld.trace.screening import Screened
 
+_GROWING = (
+    0.4,
+    0.7,
+)  # shares of the training frames on which starts are ranked, and fitted one after the other
 _EARLY = 0.4  # share of the training frames on which starts are ranked
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
-_DESIGN = 32  # places of the low-discrepancy design
-_STIFFNESS = 1.1  # logarithms of the stiffness that it spans, up and down
-_LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
+_PROFILE = (5, 2, 2)  # stiffnesses beside which strengths are estimated, of each base
+_STIFFNESS = 1.0  # logarithms of the stiffness that they span, up and down
 _FOLLOWED = 3  # of all starts, the best on the early frames whose stiffness differs
 _ITERATIONS = 2  # of each of these, on the early frames
 _SHIFTS = tuple(0.12 * k for k in range(-6, 7))  # logarithms of the stiffness about a place
@@ -60,48 +62,42 @@ class Starts:
     Attributes:
         setting: what all hypotheses share.
         early: whitener of the first part of the training frames, by the noise alone, and their end.
-        seed: of the designs.
     """
 
     setting: Setting
     early: tuple[Whitener, int]
-    seed: int = 0
 
-    def near(self, base: Hypothesis, one: Screened, basins: Sequence[Hypothesis]) -> Begun:
-        """The best of the near starts, and the linear one.
+    def begun(self, base: Hypothesis, one: Screened, basins: Sequence[Hypothesis], far: float = 0.0) -> Begun:
+        """The best of the near starts, and of the far ones, of different stiffnesses.
 
         Args:
             base: the hypothesis that gets an effect more.
             one: the effect's score beside it.
             basins: hypotheses whose calibrated numbers are tried too.
+            far: share of the far starts.
         """
-        starts = self._near(base, one, basins)
+        starts = [*self._near(base, one, basins), *(self._profiled(base, one, far) if far else ())]
         unknowns, places, errors = self._ranked(base, one, starts)
-        best = int(np.argmin(errors))
-        return Begun(one, [_named(unknowns, places[best]), starts[0]], self._promised(base, errors[best]))
-
-    def far(self, base: Hypothesis, one: Screened, basins: Sequence[Hypothesis], share: float = 1.0) -> Begun:
-        """The best of the near and far starts, fitted to the early frames.
-
-        Args:
-            base, one, basins: see :meth:`near`.
-            share: of the design's places.
-        """
-        design = self._designed(base, one, int(_DESIGN * share))
-        unknowns, places, errors = self._ranked(base, one, [*self._near(base, one, basins), *design])
-        twin, _ = self.setting.assembled((*base.members, one.candidate), base.values)
-        white, frames = self.early
         first = [u.name for u in unknowns].index(self.setting.calibrated[0].name)
-        fits: list[tuple[float, Values]] = []
         order = [int(k) for k in np.argsort(errors) if errors[k] <= NO_WORSE * min(errors)]
-        for k in [order[j] for j in distinct([places[k][first] for k in order])][:_FOLLOWED]:
-            here = starting_at(unknowns, places[k])
-            scaled = ScaledWhitener(white, self.setting.counted(errors[k]))
+        best = [order[j] for j in distinct([places[k][first] for k in order])][:_FOLLOWED]
+        return Begun(one, [_named(unknowns, places[k]) for k in best], self._promised(base, min(errors)))
+
+    def followed(self, base: Hypothesis, begun: Begun, every: bool) -> Begun:
+        """Fits to the early frames from these starts, or from the first alone."""
+        starts = begun.starts if every else begun.starts[:1]
+        unknowns, places, errors = self._ranked(base, begun.screened, starts)
+        twin, _ = self.setting.assembled((*base.members, begun.screened.candidate), base.values)
+        white, frames = self.early
+        fits: list[tuple[float, Values]] = []
+        for place, error in zip(places, errors, strict=True):
+            scaled, here = ScaledWhitener(white, self.setting.counted(error)), starting_at(unknowns, place)
             found = refit(self.setting.simulations, scaled, twin, here, frames, _ITERATIONS, hopeless=0.0)
             if found is not None:
                 fits.append(((scaled.scale * found.misfit) ** 2, _named(found.unknowns, found.theta)))
-        fits = sorted(fits, key=lambda fit: fit[0]) or [(min(errors), _named(unknowns, places[0]))]
-        return Begun(one, [values for _, values in fits], self._promised(base, fits[0][0]))
+        fits = sorted(fits, key=lambda fit: fit[0]) or [(min(errors), begun.starts[0])]
+        promised = self._promised(base, fits[0][0])
+        return Begun(begun.screened, [values for _, values in fits], promised)
 
     def promised(self, base: Hypothesis, known: Hypothesis) -> float:
         """Share of what ``base`` leaves on the early frames that goes with a hypothesis that is fitted."""
@@ -141,27 +137,24 @@ class Starts:
             ]
         return starts
 
-    def _designed(self, base: Hypothesis, one: Screened, count: int) -> list[Values]:
-        """A low-discrepancy design over strengths, stiffness, and what else is calibrated of which nothing is known
-        beforehand."""
-        first, *rest = self.setting.calibrated
-        gates = one.candidate.unknowns()
-        open_ = [u for u in rest if u.prior is None and u.name not in [gate.name for gate in gates]]
-        drawn = qmc.Sobol(1 + len(open_) + len(gates), seed=self.seed).random_base2(int(np.log2(count)))
-        places: list[Values] = []
-        for row in drawn:
-            place = dict(base.values)
-            place[first.name] += _STIFFNESS * (2.0 * row[0] - 1.0)
-            for share, unknown in zip(row[1:], open_, strict=False):
-                low, high = unknown.bounds
-                place[unknown.name] = low + share * (high - low)
-            for share, gate in zip(row[1 + len(open_) :], gates, strict=True):
-                lowest, highest = gate.bounds
-                signed = 2.0 * float(share) - 1.0 if lowest < 0 else float(share)
-                size = _LEAST_SHARE ** (1.0 - abs(signed))
-                place[gate.name] = float(np.sign(signed) * size * (highest if signed > 0 else -lowest))
-            places.append(place)
-        return places
+    def _profiled(self, base: Hypothesis, one: Screened, share: float) -> list[Values]:
+        """One Gauss-Newton step of the strengths alone on the early frames, beside other stiffnesses, and beside fewer
+        of them with each of the other bases: a strength that is estimated beside a wrong stiffness says little."""
+        white, frames = self.early
+        scaled = ScaledWhitener(white, self.setting.counted(self._error(base.fitted.tracks)))
+        first, gates = self.setting.calibrated[0].name, [u.name for u in one.candidate.unknowns()]
+        twin, unknowns = self.setting.assembled((*base.members, one.candidate), base.values)
+        found: list[Values] = []
+        for known, count in zip(_bases(self.setting.calibrated, base.values), _PROFILE, strict=False):
+            for shift in np.linspace(-_STIFFNESS, _STIFFNESS, max(int(share * count), _PROFILE[-1])):
+                place = {**known, first: known[first] + float(shift)}
+                here = [u.starting(place.get(u.name, u.start)) for u in unknowns]
+                around = at(twin, here, starts_of(here))
+                own = [u for u in here if u.name in gates]
+                fit = refit(self.setting.simulations, scaled, around, own, frames, 1, hopeless=0.0)
+                if fit is not None:
+                    found.append(place | _named(fit.unknowns, fit.theta))
+        return found
 
 
 def early_part(white: Whitener, split: Split) -> tuple[Whitener, int]:
@@ -181,14 +174,18 @@ def elsewhere(unknowns: Sequence[Unknown], own: Values) -> list[list[Values]]:
         unknowns: what is calibrated, the stiffness first.
         own: where they are, by name, in the scale of the search.
     """
+    first = unknowns[0].name
+    return [[{**base, first: own[first] + shift} for shift in _SHIFTS] for base in _bases(unknowns, own)]
+
+
+def _bases(unknowns: Sequence[Unknown], own: Values) -> list[Values]:
     bases = [own]
     for u in unknowns[1:]:
         if u.name in own and u.prior is None:
             bases.append({**own, u.name: u.bounds[0] + 0.25 * (u.bounds[1] - u.bounds[0])})
         elif u.name in own and u.name in _SHAPES and u.prior is not None:
             bases.append({**own, u.name: own[u.name] + u.prior[1]})
-    first = unknowns[0].name
-    return [[{**base, first: own[first] + shift} for shift in _SHIFTS] for base in bases]
+    return bases
 
 
 def distinct(stiffnesses: Sequence[float], taken: Sequence[float] = ()) -> list[int]:
