@@ -13,6 +13,8 @@ from physworld_schemas.library import NamesOf
 from physworld_schemas.standing import standing_of
 
 MOST_PARTICLES = 200_000
+MOST_RECORDINGS = 8
+"""Further ones of an object, beside the first."""
 
 
 class FitConfig(Request):
@@ -110,13 +112,48 @@ class FitConfig(Request):
         return self.law is None and usual_form and self.stages == "global"
 
 
+FURTHER: Any = Field(
+    default_factory=list,
+    max_length=MOST_RECORDINGS,
+    description="Further recordings of the same object, fitted together.",
+)
+"""The field of a request that names them."""
+
+
+def require_each_once(*scene_ids: str) -> None:
+    """Raises ValueError where a recording comes more than once."""
+    twice = sorted({known for known in scene_ids if scene_ids.count(known) > 1})
+    if twice:
+        raise ValueError(f"a recording is fitted or held out, once: {', '.join(twice)} came more than once")
+
+
+def require_no_field(config: FitConfig, scene_ids: list[str]) -> None:
+    """Raises ValueError where a field over the body is asked for of several recordings."""
+    if scene_ids and config.stages != "global":
+        raise ValueError(
+            f"the local stage of stages {config.stages!r} fits a field to one recording; scene_ids adds "
+            f"{len(scene_ids)}"
+        )
+
+
 class FitCreate(Request):
-    """Body of POST /v1/fits."""
+    """Body of POST /v1/fits.
+
+    ``scene_ids`` are further recordings of the same object: one material for all, and of each its own body, start and
+    grips. A field over the body (``stages``) is fitted to one recording.
+    """
 
     scene_id: str = Field(
         description="Scene to calibrate a twin of.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
     )
+    scene_ids: list[str] = FURTHER
     config: FitConfig = Field(default_factory=FitConfig, description="Settings.")
+
+    @model_validator(mode="after")
+    def _several(self) -> Self:
+        require_each_once(self.scene_id, *self.scene_ids)
+        require_no_field(self.config, self.scene_ids)
+        return self
 
 
 class Parameter(Resource):
@@ -219,6 +256,9 @@ class LocalStage(Resource):
 class Fit(Resource):
     """A calibrated twin: parameters, metrics on held-out frames, ``twin.npz`` and ``report.json``.
 
+    Of several recordings ``metrics`` has the errors of each in ``recordings``, and in ``agreement`` how far the own
+    optimum of each lies off the common one; their twins are ``twin_2.npz`` and so on.
+
     ``numerics``, and ``converged``, the searched parameters extrapolated to cells of no size, are null where they were
     not measured; ``not_measured`` says why. ``local`` is null where no local stage was asked for. ``notes`` say how
     the body was built.
@@ -226,6 +266,7 @@ class Fit(Resource):
 
     id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
     scene_id: str = Field(description="Scene that it is about.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    scene_ids: list[str] = Field(default_factory=list, description="Further recordings.")
     state: Literal["pending", "ready", "failed", "cancelled"] = Field(
         description="Whether the twin is there."
     )

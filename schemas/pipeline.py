@@ -8,13 +8,16 @@ from pydantic import Field, model_validator
 
 from physworld_schemas.base import Request, Resource
 from physworld_schemas.dataset import DatasetConfig
-from physworld_schemas.fit import FitConfig
+from physworld_schemas.fit import FURTHER, FitConfig, require_each_once, require_no_field
 from physworld_schemas.model import TrainingConfig
 from physworld_schemas.trace import NO_OTHER_PHYSICS, TraceConfig
 
 
 class PipelineCreate(Request):
     """Body of POST /v1/pipelines. ``model_name`` null takes the scene's name.
+
+    ``scene_ids`` are further recordings of the same object, fitted (and traced) together with it; demonstrations and
+    figures are the first one's.
 
     ``close_the_loop`` traces what the fit leaves unexplained; where an effect is named, the twin that carries it
     demonstrates. ``compare`` then also trains a model on the fit's own twin, unless a version of the same name, scene
@@ -24,6 +27,7 @@ class PipelineCreate(Request):
     scene_id: str = Field(
         description="Recording to make a world model of.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
     )
+    scene_ids: list[str] = FURTHER
     model_name: str | None = Field(
         default=None,
         pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$",
@@ -46,6 +50,12 @@ class PipelineCreate(Request):
     def _traceable(self) -> Self:
         if self.close_the_loop and not self.fit.usual_physics:
             raise ValueError(NO_OTHER_PHYSICS)
+        return self
+
+    @model_validator(mode="after")
+    def _several(self) -> Self:
+        require_each_once(self.scene_id, *self.scene_ids)
+        require_no_field(self.fit, self.scene_ids)
         return self
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from physworld_schemas.base import UNIT_BESIDE, Artifact, Lineage, Request, Resource, Seed
-from physworld_schemas.fit import FitConfig
+from physworld_schemas.fit import FURTHER, MOST_RECORDINGS, FitConfig, require_each_once
 from physworld_schemas.library import NamesOf
 
 Verdict = Literal[
@@ -69,7 +69,6 @@ class TraceConfig(Request):
     )
 
 
-MOST_RECORDINGS = 8
 TRACE_PARTICLES = 1000
 """Coarser than a fit's: a trace runs a thousand simulations."""
 
@@ -94,11 +93,7 @@ class TraceCreate(Request):
     scene_id: str = Field(
         description="Recording whose residual is traced.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
     )
-    scene_ids: list[str] = Field(
-        default_factory=list,
-        max_length=MOST_RECORDINGS,
-        description="Further recordings of the same object, fitted together.",
-    )
+    scene_ids: list[str] = FURTHER
     held_out_scene_ids: list[str] = Field(
         default_factory=list, max_length=MOST_RECORDINGS, description="Recordings that only the report sees."
     )
@@ -119,12 +114,7 @@ class TraceCreate(Request):
 
     @model_validator(mode="after")
     def _each_once(self) -> Self:
-        every = [self.scene_id, *self.scene_ids, *self.held_out_scene_ids]
-        twice = sorted({known for known in every if every.count(known) > 1})
-        if twice:
-            raise ValueError(
-                f"a recording is fitted or held out, once: {', '.join(twice)} came more than once"
-            )
+        require_each_once(self.scene_id, *self.scene_ids, *self.held_out_scene_ids)
         return self
 
 

@@ -37,6 +37,7 @@ _LIFTED = (
     "search",
     "local",
     "notes",
+    "scene_ids",
 )  # of a fit's metrics: fields of their own
 
 
@@ -221,7 +222,7 @@ def mark_fit_ready(
         raise Conflict(f"fit {fit_id} is {row.state}; only a pending fit can become ready")
     row.state = "ready"
     row.parameters = {name: parameter.model_dump(mode="json") for name, parameter in parameters.items()}
-    row.metrics = metrics
+    row.metrics = {**row.metrics, **metrics}  # which other recordings were asked for stays
     row.artifacts = _plain(artifacts)
     row.lineage = lineage.model_dump(mode="json")
     session.flush()

@@ -19,8 +19,8 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.calibrate.rod_parameters import rod_parameters
-from physworld.calibrate.rods import RodSearch
+from physworld.calibrate.rod_parameters import SHAPE, rod_parameters
+from physworld.calibrate.rod_search import RodSearch
 from physworld.engine.rods.chain import Chain
 from physworld.errors import SceneUnsupported
 from physworld.estimation.unknowns import at
@@ -32,7 +32,6 @@ from physworld.twin.twin import Twin
 _ROLLS, _FAR_ROLLS = 16, (0.0, -1.0, 1.0, -2.0, 2.0, -3.0, 3.0)
 _DESCENTS, _STEPS, _STEP_RAD = 3, 6, 0.02
 _EARLY = 0.43  # of the training frames, for the scan
-_SHAPE = ("curvature_", "natural_twist", "grip_angle_")
 _ROUNDS = 4  # descents, each with what the one before it leaves as the deviation of a residual
 
 
@@ -71,7 +70,7 @@ def _shaped_as_seen(own: Twin, scene: Scene) -> Twin:
     """The rod with the rest shape of the training frames, near the one that it has."""
     shape = []
     for unknown in rod_parameters(scene, own):
-        if unknown.name.startswith(_SHAPE) and unknown.read is not None and unknown.prior is not None:
+        if unknown.name.startswith(SHAPE) and unknown.read is not None and unknown.prior is not None:
             here = unknown.read(own)
             shape.append(replace(unknown, start=here, prior=(here, unknown.prior[1])))
     search = RodSearch(scene, own, 2 * _ROUNDS * (_STEPS + 1))

@@ -20,7 +20,7 @@ Priors: woven cotton bends with 1e-5 to 1e-4 N m (Wang, O'Brien and Ramamoorthi 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -28,8 +28,17 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from physworld.arrays import Array
-from physworld.calibrate.estimates import Correlations, Estimate, training_losses
+from physworld.calibrate.estimates import Correlations, Estimate
 from physworld.calibrate.parameters import Parameter
+from physworld.calibrate.recordings import (
+    SAYS_NOTHING,
+    Agreement,
+    agreement_of,
+    of_one_object,
+    of_recording,
+    recorded,
+    together,
+)
 from physworld.effects.actuation_lag import ActuationLag
 from physworld.effects.air_on_sheet import AirOnSheet
 from physworld.effects.base import Effect
@@ -138,7 +147,7 @@ class _Search:
                 self._runs[key] = None
         return self._runs[key]
 
-    def residuals(self, theta: Array) -> Array | None:
+    def residuals(self, theta: Array) -> Any:
         """Rows of a frame, (T, 3 N + 1): points' and the stamp's residuals in their deviations; None for no run."""
         paths = self.paths(theta)
         if paths is None:
@@ -155,28 +164,38 @@ class _Search:
         off = np.sqrt(share)[:, None, None] * (off + stamp[:, None, None] * speed)
         return np.concatenate([off.reshape(len(off), -1), stamp[:, None] / _STAMP_S], axis=1)
 
+    def misfit(self, rows: Any) -> float:
+        """The robust cost of rows of residuals."""
+        return self.weights(rows)[0]
+
     def weights(self, rows: Array) -> tuple[float, Array]:
         """The robust cost of rows of residuals and the weights of their frames."""
         limit = _HUBER**2 * 3.0 * _POINTS
         root = np.sqrt(1.0 + (rows**2).sum(axis=1) / limit)
         return float(2.0 * limit * (root - 1.0).sum()) / _FRAMES, 1.0 / (root * _FRAMES)
 
-    def cost(self, rows: Array | None, theta: Array) -> float:
+    def cost(self, rows: Any, theta: Array) -> float:
         """Of residuals and of what the unknowns are off their priors."""
         if rows is None:
             return float("inf")
-        return self.weights(rows)[0] + float(np.sum(((theta - self.mean) / self.spread) ** 2))
+        return self.misfit(rows) + float(np.sum(((theta - self.mean) / self.spread) ** 2))
 
-    def normal(self, theta: Array, rows: Array) -> tuple[Array, Array]:
+    def normal(self, theta: Array, rows: Any) -> tuple[Array, Array]:
         """Normal matrix (p, p) and gradient (p,) at theta, half the second and first derivatives of the cost."""
+        matrix, gradient = self.information(theta, rows)
+        return matrix + np.diag(self.spread**-2.0), gradient + (theta - self.mean) / self.spread**2
+
+    def information(self, theta: Array, rows: Any) -> tuple[Array, Array]:
+        """The same without the priors."""
         columns = []
         for k, step in enumerate(_STRIDE * self.spread):
             there = self.residuals(theta + step * np.eye(len(theta))[k])
             columns.append(np.zeros_like(rows) if there is None else (there - rows) / step)
         jacobian = np.stack(columns, axis=-1)
         weight = self.weights(rows)[1]
-        matrix = np.einsum("t,tmi,tmj->ij", weight, jacobian, jacobian) + np.diag(self.spread**-2.0)
-        return matrix, np.einsum("t,tmi,tm->i", weight, jacobian, rows) + (theta - self.mean) / self.spread**2
+        matrix: Array = np.einsum("t,tmi,tmj->ij", weight, jacobian, jacobian)
+        gradient: Array = np.einsum("t,tmi,tm->i", weight, jacobian, rows)
+        return matrix, gradient
 
     def descend(self) -> tuple[Array, Array]:
         """Gauss-Newton from the priors' means: where it ends, and the normal matrix there."""
@@ -208,20 +227,65 @@ class _Search:
                 break
         return theta, matrix
 
+    def agreement(self, theta: Array) -> tuple[Agreement, ...]:
+        """Whether several recordings agree on the object's numbers: of one there is nothing to be said."""
+        return ()
+
+
+class _Shared(_Search):
+    """Runs of a calibration over several recordings, each of which has a camera of its own; see :class:`_Search`."""
+
+    def __init__(self, parts: list[_Search], unknowns: list[Parameter]) -> None:
+        lead = parts[0]
+        super().__init__(lead.scene, lead.twin, unknowns, lead.limit, lead.progress, lead.cancelled)
+        self.parts, self.runs = parts, sum(part.runs for part in parts)
+        self.places = [of_recording(unknowns, k) for k in range(len(parts))]
+
+    def residuals(self, theta: Array) -> Any:
+        """Rows of every recording; None where one of them has no run."""
+        found = [part.residuals(theta[own]) for part, own in zip(self.parts, self.places, strict=True)]
+        self.simulations = sum(part.simulations for part in self.parts)
+        return None if any(rows is None for rows in found) else found
+
+    def misfit(self, rows: Any) -> float:
+        """The robust cost of all of them."""
+        return sum(part.misfit(own) for part, own in zip(self.parts, rows, strict=True))
+
+    def information(self, theta: Array, rows: Any) -> tuple[Array, Array]:
+        """What all of them say together, without the priors."""
+        matrix, gradient = np.zeros((len(theta), len(theta))), np.zeros(len(theta))
+        for part, own, there in zip(self.parts, self.places, rows, strict=True):
+            known, pull = part.information(theta[own], there)
+            matrix[np.ix_(own, own)] += known
+            gradient[own] += pull
+        self.simulations = sum(part.simulations for part in self.parts)
+        return matrix, gradient
+
+    def agreement(self, theta: Array) -> tuple[Agreement, ...]:
+        """Whether the recordings agree on the sheet and the air around it."""
+        rows, shifted = self.residuals(theta), []
+        for part, own, there in zip(self.parts, self.places, rows or (), strict=bool(rows)):
+            known, pull = part.information(theta[own], there)
+            covariance = np.linalg.inv(known + np.diag(self.spread[own] ** -2.0))
+            deviation = np.sqrt(np.diag(covariance))
+            deviation[deviation > SAYS_NOTHING * self.spread[own]] = np.inf
+            shifted.append((own, -covariance @ pull, deviation))
+        return agreement_of(self.unknowns, theta, shifted)
+
 
 def calibrate_cloth(
-    scene: Scene,
-    twin: Twin,
+    scenes: Sequence[Scene],
+    twins: Sequence[Twin],
     config: CalibrationConfig,
     progress: Progress | None,
     cancelled: Callable[[], bool] | None,
     journal: Journal | None,
 ) -> FitResult:
-    """Fit a hung sheet to the training frames of ``scene``; see the module's text.
+    """Fit a hung sheet to the training frames of recordings; see the module's text.
 
     Args:
-        scene: the recording.
-        twin: with prior numbers.
+        scenes: the recordings.
+        twins: of each, with prior numbers.
         config: settings; ``damping`` "none" searches neither drag nor internal friction.
         progress: called with (runs done, runs at most, message).
         cancelled: polled before every run.
@@ -234,9 +298,20 @@ def calibrate_cloth(
     from physworld.calibrate.global_stage import FitResult
 
     begun = time.perf_counter()
-    twin = with_priors(scene, twin)
-    unknowns = cloth_parameters(scene, twin, config.damping == "auto")
-    search = _Search(scene, twin, unknowns, config.max_simulations, progress, cancelled)
+    twins = of_one_object([with_priors(*pair) for pair in zip(scenes, twins, strict=True)])
+    each = [cloth_parameters(*pair, config.damping == "auto") for pair in zip(scenes, twins, strict=True)]
+    unknowns = together(each, lambda name: name.split(".")[0] in _CAMERA)
+    parts = [
+        _Search(
+            *pair,
+            [unknowns[p] for p in of_recording(unknowns, k)],
+            config.max_simulations,
+            progress,
+            cancelled,
+        )
+        for k, pair in enumerate(zip(scenes, twins, strict=True))
+    ]
+    search = parts[0] if len(parts) == 1 else _Shared(parts, unknowns)
 
     def descend() -> dict[str, Any]:
         theta, matrix = search.descend()
@@ -245,23 +320,27 @@ def calibrate_cloth(
 
     kept = (journal or Journal()).step("cloth", descend)
     theta, covariance = np.array(kept["theta"]), np.linalg.inv(np.array(kept["matrix"]))
-    fitted = at(twin, unknowns, theta)
-    nodes = fitted.simulate_nodes(*scene.control_track(), scene.times)
-    tracks = fitted.observe(nodes, scene.times)
+    predicted = [
+        recorded(part.scene, at(part.twin, part.unknowns, theta[of_recording(unknowns, k)]))
+        for k, part in enumerate(parts)
+    ]
+    lead = predicted[0]
     found = _estimates(unknowns, theta, covariance, kept["cut_short"])
     return FitResult(
-        twin=fitted,
+        twin=lead.twin,
         parameters=found,
         searched=tuple(unknowns),
         correlations=Correlations(tuple(u.name for u in unknowns), correlations(covariance)),
-        tracks=tracks,
-        particles=fitted.particles_at(nodes),
-        losses=training_losses(scene, tracks),
+        tracks=lead.tracks,
+        particles=lead.particles,
+        losses=lead.losses,
         simulations=kept["simulations"],
         seconds=time.perf_counter() - begun,
         loss_history=list(kept["history"]),
         cut_short=kept["cut_short"],
         open={name: known.note for name, known in found.items() if kept["cut_short"]},
+        recordings=tuple(predicted) if len(predicted) > 1 else (),
+        agreement=() if kept["cut_short"] else search.agreement(theta),
     )
 
 

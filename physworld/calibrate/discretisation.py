@@ -40,7 +40,7 @@ def converged_parameters(
     """Estimates of the searched parameters without the error of the lattice.
 
     Args:
-        scene: the recording; its training frames count.
+        scene: the recording, of several the first; its training frames count.
         fitted: the calibration.
         particle_budget: the one that it was made with.
         refinement: cells of the finer lattice are this many times smaller.
@@ -55,6 +55,8 @@ def converged_parameters(
     visible = scene.visible[:end]
     places = []
     for parameter in fitted.searched:
+        if parameter.recording:  # of another recording than the first, whose tracks these are
+            continue
         now = parameter.searched(fitted.parameters[parameter.name].value)
         below = now + parameter.step > parameter.bounds[1]
         places.append((parameter, now, -parameter.step if below else parameter.step))

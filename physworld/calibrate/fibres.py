@@ -97,9 +97,9 @@ def _along(
 ) -> Optimum:
     """The optimum over the window with the fibres' direction as it is; all numbers are in its theta."""
     modulus, *angles = fibres
-    before = search.twin
+    before = search.twins
     for angle, value in zip(angles, theta[-len(angles) :], strict=True):
-        search.twin = angle.apply(search.twin, float(value))
+        search.twins = [angle.apply(twin, float(value)) for twin in search.twins]
     found = search.solve([*kept, modulus], theta[: -len(angles)], 3, window)
-    search.twin = before
+    search.twins = before
     return Optimum(np.concatenate([found.theta, theta[-len(angles) :]]), found.cost)

@@ -22,7 +22,7 @@ resumable: see :mod:`physworld.estimation.journal`.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -39,7 +39,6 @@ from physworld.calibrate.estimates import (
     cut_short,
     estimates,
     held_at_priors,
-    training_losses,
 )
 from physworld.calibrate.fibres import free_fibres
 from physworld.calibrate.local_stage import LocalResult
@@ -52,6 +51,14 @@ from physworld.calibrate.parameters import (
     relaxing,
     release,
 )
+from physworld.calibrate.recordings import (
+    Agreement,
+    Recorded,
+    SharedSearch,
+    of_one_object,
+    recorded,
+    together,
+)
 from physworld.calibrate.rods import calibrate_rod
 from physworld.calibrate.search import Progress, Search
 from physworld.devices import default_device
@@ -59,7 +66,7 @@ from physworld.engine.thin.triangles import Mesh
 from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import Solution
 from physworld.estimation.simulations import Runner, in_turn
-from physworld.estimation.unknowns import LINEAR, at
+from physworld.estimation.unknowns import LINEAR
 from physworld.geometry.sheet_body import is_hung_sheet
 from physworld.materials.cable import CableLaw
 from physworld.materials.library import with_law
@@ -131,6 +138,8 @@ class FitResult:
         rejected: parameters that were tried and not kept, with the share of the cost that they removed.
         local: what the local stage found, or None where it was not asked for; a field that it kept is the twin's.
         homogeneous: tracks of the twin without that field, (T, N, 3) [m]; None without one.
+        recordings: of several recordings every one, the first too; empty for one.
+        agreement: of several recordings, whether they agree on the object's numbers.
     """
 
     twin: Twin
@@ -148,10 +157,12 @@ class FitResult:
     rejected: dict[str, float] = field(default_factory=dict)
     local: LocalResult | None = None
     homogeneous: Array | None = None
+    recordings: tuple[Recorded, ...] = ()
+    agreement: tuple[Agreement, ...] = ()
 
 
 def calibrate(
-    scene: Scene,
+    scene: Scene | Sequence[Scene],
     config: CalibrationConfig | None = None,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
@@ -161,7 +172,7 @@ def calibrate(
     """Fit a twin to the training frames of ``scene``.
 
     Args:
-        scene: the recording.
+        scene: the recording, or several of one object (:mod:`physworld.calibrate.recordings`).
         config: settings; None for the defaults.
         progress: called with (runs done, runs at most, message).
         cancelled: polled every frame of every run.
@@ -171,18 +182,19 @@ def calibrate(
     Raises:
         CalibrationError: no start gave a usable simulation.
         Cancelled: ``cancelled`` returned true.
-        SceneUnsupported: the scene declares too little for a body.
+        SceneUnsupported: the scene declares too little for a body, or recordings are not of one form of body.
         ValueError: there is no such law for the body, or no such flow law.
     """
     config = config or CalibrationConfig()
     started = time.perf_counter()
-    prior = prior_twin(scene, config)
-    if prior.natural is not None:
-        return calibrate_rod(scene, prior, config, progress, cancelled, journal)
-    if is_hung_sheet(scene, config.mesh):
-        return calibrate_cloth(scene, prior, config, progress, cancelled, journal)
-    search = Search(scene, prior, config.max_simulations, progress, cancelled, journal, runner)
-    parameters = searched_parameters(scene, search.twin, config)
+    scenes = [scene] if isinstance(scene, Scene) else list(scene)
+    priors = of_one_object([prior_twin(known, config) for known in scenes])
+    if priors[0].natural is not None:
+        return calibrate_rod(scenes, priors, config, progress, cancelled, journal)
+    if is_hung_sheet(scenes[0], config.mesh):
+        return calibrate_cloth(scenes, priors, config, progress, cancelled, journal)
+    search = _search(scenes, priors, config.max_simulations, progress, cancelled, journal, runner)
+    parameters = together([searched_parameters(*of, config) for of in zip(scenes, priors, strict=True)])
     search.limit = config.max_simulations - min(_KEPT_BACK, config.max_simulations // 4)
     kept, optimum, rejected = select(search, parameters)
     search.limit = config.max_simulations - (len(kept) + 1 if config.max_simulations > _KEPT_BACK else 0)
@@ -190,28 +202,35 @@ def calibrate(
         optimum = search.solve(kept, optimum.theta, 5)
     search.limit = config.max_simulations
     kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)
-    twin = at(search.twin, kept, optimum.theta)
     found, correlated = _estimates(search, kept, optimum, solution, search.mistaken(kept, optimum))
     if search.cut_short:
         found = cut_short(found, config.max_simulations)
-    held = held_at_priors(scene, twin, rejected, parameters)
-    times, controls = scene.control_track()
-    nodes = twin.simulate_nodes(times, controls, scene.times)
-    tracks = twin.observe(nodes, scene.times)
+    each = [recorded(known, search.at(kept, optimum.theta, k)) for k, known in enumerate(scenes)]
+    held = held_at_priors(scenes[0], each[0].twin, rejected, parameters)
     return FitResult(
-        twin=twin,
+        twin=each[0].twin,
         parameters={**found, **{name: e for name, e in held.items() if name not in found}},
         searched=tuple(kept),
         correlations=correlated,
-        tracks=tracks,
-        particles=twin.particles_at(nodes),
-        losses=training_losses(scene, tracks),
+        tracks=each[0].tracks,
+        particles=each[0].particles,
+        losses=each[0].losses,
         simulations=search.simulations,
         seconds=time.perf_counter() - started,
         loss_history=search.history,
         cut_short=search.cut_short,
         open={name: e.note for name, e in found.items() if search.cut_short or e.note in NOT_CONVERGED},
         rejected=rejected,
+        recordings=tuple(each) if len(each) > 1 else (),
+        agreement=() if solution is None or search.cut_short else search.agreement(kept, solution),
+    )
+
+
+def _search(scenes: list[Scene], priors: list[Twin], *settings: Any) -> Search:
+    return (
+        Search(scenes[0], priors[0], *settings)
+        if len(scenes) == 1
+        else SharedSearch(scenes, priors, *settings)
     )
 
 
@@ -292,7 +311,7 @@ def free_optional(
         optimum: its optimum, theta (p,) and cost [m^2].
         candidates: optional parameters.
     """
-    twin = at(search.twin, kept, optimum.theta)
+    twin = search.at(kept, optimum.theta)
     candidates = [affordable(search.scene, twin, p) for p in candidates]
     rejected: dict[str, float] = {}
     while candidates:
@@ -363,13 +382,13 @@ def _hold_the_unknown(
             break
         loose = unknown[0]
         others = [k for k, p in enumerate(kept) if p is not loose]
-        before = search.twin
+        before = search.twins
         if loose.stage == "stiffness":
-            search.twin = loose.apply(before, loose.starts[0])
+            search.twins = [loose.apply(twin, loose.starts[0]) for twin in before]
         trial = search.solve([kept[k] for k in others], optimum.theta[others], 3)
         rejected[loose.name] = 1.0 - optimum.cost / trial.cost
         if not trial.cost * (1.0 - _NO_LOSS) <= optimum.cost:
-            search.twin = before
+            search.twins = before
             del rejected[loose.name]
             break
         kept, optimum = [kept[k] for k in others], trial

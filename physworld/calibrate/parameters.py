@@ -93,6 +93,7 @@ class Parameter(Unknown):
         held: value of one that is not freed.
         least_gain: share of the training cost that freeing an optional one must remove.
         read: its value in a twin, in its unit; None: it is among the twin's ``parameters`` or follows from them.
+        recording: number of the recording that it belongs to, where several are fitted; None: it is the object's.
     """
 
     starts: tuple[float, ...]
@@ -102,6 +103,7 @@ class Parameter(Unknown):
     held: float = 0.0
     least_gain: float = _LEAST_GAIN
     read: Callable[[Twin], float] | None = None
+    recording: int | None = None
 
 
 def parameters_of(
@@ -133,7 +135,7 @@ def parameters_of(
     if ground_friction and "ground_friction" in twin.parameters:
         prior = twin.parameters["ground_friction"]
         optional.append(
-            Parameter("ground_friction", "1", *_FRICTION_BOUNDS, _set("ground_friction"), step=0.05, starts=(prior,),
+            Parameter("ground_friction", "1", *_FRICTION_BOUNDS, _rubs, step=0.05, starts=(prior,),
                       stage="optional", held=prior)
         )  # fmt: skip
     return [
@@ -393,6 +395,11 @@ def _positive(name: str, unit: str, low: float, high: float, start: float) -> Pa
 
 def _set(name: str) -> Callable[[Twin, float], Twin]:
     return lambda twin, value: twin.with_parameters(**{name: value})
+
+
+def _rubs(twin: Twin, friction: float) -> Twin:
+    """Of several recordings some may have no ground."""
+    return twin if twin.ground_height_m is None else twin.with_parameters(ground_friction=friction)
 
 
 def _delayed(twin: Twin, delay_s: float) -> Twin:

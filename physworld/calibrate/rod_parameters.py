@@ -23,6 +23,8 @@ from physworld.twin.twin import Twin
 GRAVITY = 9.81
 DRIVE = "drive_"
 """How the names of what drives a rod begin."""
+SHAPE = ("curvature_", "natural_twist", "grip_angle_")
+"""How the names of a rod's rest shape begin."""
 LOSSES = (
     "relaxation_s", "air_drag_per_s", "drag_normal_per_m", "friction_per_m", "friction_onset_per_m", "creep_ratio",
     "creep_s",

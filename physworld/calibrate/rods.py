@@ -11,6 +11,9 @@ count as one. Nothing is selected: a number that the data do not ask for stays n
    since the first step): a window that grows finds the basin that all frames at once miss. All frames again as long as
    sigma falls.
 
+Of several recordings of one object (:mod:`physworld.calibrate.recordings`) sigma and n_c are each one's own, and so is
+its window.
+
 A launch integrates a twin and what differs from it by one step in each number, side by side; it is counted as one
 simulation. Priors: curvature of its own as of a coil of some windings, torsion of a round section, air drag of ropes
 and foam rods in air, friction and creep small.
@@ -20,7 +23,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,228 +34,46 @@ from physworld.calibrate.estimates import (
     UNIDENTIFIED_HALF_WIDTH,
     Correlations,
     Estimate,
-    training_losses,
 )
 from physworld.calibrate.parameters import Parameter
+from physworld.calibrate.recordings import Agreement, recorded, together, twin_at
 from physworld.calibrate.rod_parameters import DRIVE, GRAVITY, LOSSES, rod_parameters, steps_seen
-from physworld.engine.rods.discrete_rods import DiscreteRods
-from physworld.errors import CalibrationError, Cancelled, SimulationError
+from physworld.calibrate.rod_recordings import SharedRodSearch, of_a_recording, require_alike
+from physworld.calibrate.rod_search import Progress, RodSearch, off_priors
+from physworld.errors import CalibrationError
 from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import correlations
-from physworld.estimation.unknowns import LINEAR, at
+from physworld.estimation.unknowns import LINEAR
 from physworld.scene import Scene
-from physworld.twin.rods import driven_at, shapes
 from physworld.twin.twin import Twin
 
 if TYPE_CHECKING:
     from physworld.calibrate.global_stage import CalibrationConfig, FitResult
 
-Progress = Callable[[int, int, str], None]
-
-_WINDOWS = (0.17, 0.43, 0.71, 1.0)
 _STARTS = (5e-4, 2e-3, 8e-3, 3e-2, 0.2, 1.5)  # of rho A g L^3: bending stiffnesses that hang visibly
 _STIFF_STARTS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # of what rings by itself: denser, for its phase
 _FIRST = ("bending_n_m2", "relaxation_s", "air_drag_per_s")
 _FIRST_STEPS, _STEPS = 5, 8
-_DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-_LONGEST_STEP = 1.0
 _AGAIN, _STEADY = (
     6,
     0.95,
 )  # descents on all frames while what is left of them still falls to less than this share
-_ENOUGH, _SETTLED = 1e-4, 3e-3  # relative falls of the cost: what counts, and what is worth another Jacobian
-_CORRELATED = 2.0  # times sqrt(L / g)
-_SIGMA_SHARE = 0.005  # of the length: what a rod leaves before anything is known
 _Z95 = 1.96
 
 
-@dataclass
-class RodSearch:
-    """Launches of one calibration, and what they have to explain.
-
-    Attributes:
-        scene: the recording.
-        twin: of a discrete rod; what is launched differs from it by its numbers.
-        limit: launches at most.
-        progress: called with (launches done, launches at most, message).
-        cancelled: polled before every launch.
-        simulations: launches done.
-        cut_short: something was left out for want of launches.
-    """
-
-    scene: Scene
-    twin: Twin
-    limit: int
-    progress: Progress | None = None
-    cancelled: Callable[[], bool] | None = None
-    simulations: int = 0
-    cut_short: bool = False
-
-    def __post_init__(self) -> None:
-        times, controls = self.scene.control_track()
-        self.end = self.scene.train[1]
-        self.run = self.twin.integration(times, controls, self.scene.times[: self.end])
-        self.shapes = shapes(self.twin)
-        self.history: list[float] = []
-        length = float(self.twin.lattice.particle_measures.sum())
-        self.sigma = max(self.scene.noise_sigma_m or 0.0, _SIGMA_SHARE * length)
-        step = float(np.median(np.diff(self.scene.times)))
-        self.together = max(1.0, _CORRELATED * float(np.sqrt(length / GRAVITY)) / step)
-
-    def tracks(self, twins: Sequence[Twin], end: int) -> list[Array | None]:
-        """Tracked points (end, N, 3) of twins in one launch; None where the run cannot be trusted."""
-        if self.cancelled is not None and self.cancelled():
-            raise Cancelled(f"calibration cancelled after {self.simulations} runs")
-        run, base = self.run, self.run.problem
-        assert base.sections is not None
-        frames = run.frame_index[:end]
-        knots = max(2, int(frames.max()) + 1)
-        problems = [
-            replace(
-                base,
-                law=twin.law,
-                drag_per_s=twin.air_drag_per_s,
-                stiffness_factor=None if twin.properties is None else np.exp(twin.properties[:, 0]),
-                density_factor=None if twin.properties is None else np.exp(twin.properties[:, 1]),
-                sections=replace(
-                    base.sections,
-                    natural=self.shapes @ twin.natural,
-                    driven=driven_at(twin.drive, run.knots[:knots]),
-                    turns=base.sections.turns[:knots],
-                ),
-            )
-            for twin in twins
-        ]
-        held = replace(run.held, positions=run.held.positions[:knots], velocities=run.held.velocities[:knots])
-        self.simulations += 1
-        rods = self._solver(problems)
-        found = rods.run(self.twin.body.start, run.velocity, [held], run.knots[:knots])
-        cut = replace(run, frame_index=frames)
-        return [
-            None
-            if isinstance(nodes, SimulationError)
-            else self.twin.track_nodes(cut.at_frames(self.twin.body.start, nodes))
-            for nodes in found
-        ]
-
-    def _solver(self, problems: list[Any]) -> DiscreteRods:
-        if len(problems) == 1 or not problems[0].terms:
-            return DiscreteRods(problems)
-        return _InTurn(problems)
-
-    def residuals(self, twins: Sequence[Twin], end: int) -> list[Array | None]:
-        """Residuals [m] of the visible points over the frames up to ``end``, frame 0 left out."""
-        mask = self.scene.visible[1:end]
-        target = self.scene.points[1:end]
-        return [
-            None if tracks is None else self.scene.weighed(tracks[1:] - target)[mask].ravel()
-            for tracks in self.tracks(twins, end)
-        ]
-
-    def reaches(self, launches: int) -> bool:
-        """Whether so many launches are left; the search is cut short where they are not."""
-        reaches = self.simulations + launches <= self.limit
-        self.cut_short |= not reaches
-        return reaches
-
-    def tell(self, unknowns: Sequence[Parameter], theta: Array, rms: float) -> None:
-        self.history.append(rms)
-        if self.progress is not None:
-            shown = ", ".join(
-                f"{p.name} {p.value(float(t)):.3g}" for p, t in list(zip(unknowns, theta, strict=True))[:3]
-            )
-            self.progress(self.simulations, self.limit, f"{1e3 * rms:.2f} mm at {shown}")
-
-    def descend(
-        self, unknowns: Sequence[Parameter], theta: Array, end: int, steps: int
-    ) -> tuple[Array, float]:
-        """Gauss-Newton with priors over the frames up to ``end``: where it ends, and the cost there.
-
-        Args:
-            unknowns: with their priors and bounds.
-            theta: where it begins, in the unknowns' transforms, (p,).
-            end: the frame after the last one.
-            steps: at most.
-        """
-        cost = np.inf
-        for _ in range(steps):
-            if not self.reaches(2):
-                break
-            residual, jacobian = self.linearised(unknowns, theta, end)
-            if residual is None or jacobian is None:
-                break
-            off, prior = _prior(unknowns, theta)
-            cost = self.cost(residual, off)
-            weight = 1.0 / (self.sigma**2 * self.together)
-            normal = weight * jacobian.T @ jacobian + np.diag(prior**2)
-            gradient = weight * jacobian.T @ residual + prior * off
-            trials = []
-            for damping in _DAMPINGS:
-                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-                trials.append(_within(unknowns, theta + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)))
-            costs = [
-                np.inf if found is None else self.cost(found, _prior(unknowns, trial)[0])
-                for trial, found in zip(
-                    trials, self.residuals([at(self.twin, unknowns, t) for t in trials], end), strict=True
-                )
-            ]
-            best = int(np.argmin(costs))
-            if not costs[best] < cost * (1.0 - _ENOUGH):
-                break
-            settled = costs[best] > cost * (1.0 - _SETTLED)
-            theta, cost = trials[best], float(costs[best])
-            self.tell(unknowns, theta, float(np.sqrt(np.mean(residual**2))))
-            if settled:
-                break
-        return theta, cost
-
-    def linearised(
-        self, unknowns: Sequence[Parameter], theta: Array, end: int
-    ) -> tuple[Array | None, Array | None]:
-        """Residual (m,) and sensitivities (m, p) at theta; None where a run failed."""
-        places = [theta] + [theta + np.eye(len(theta))[k] * u.step for k, u in enumerate(unknowns)]
-        now, *there = self.residuals([at(self.twin, unknowns, place) for place in places], end)
-        if now is None:
-            return None, None
-        columns = [
-            np.zeros_like(now) if one is None else (one - now) / u.step
-            for one, u in zip(there, unknowns, strict=True)
-        ]
-        return now, np.stack(columns, axis=1)
-
-    def cost(self, residual: Array, off: Array) -> float:
-        """Of residuals (m,) and of what the unknowns are off their priors (p,)."""
-        return float(residual @ residual) / (self.sigma**2 * self.together) + float(off @ off)
-
-
-class _InTurn(DiscreteRods):
-    """Copies whose terms have memory run one after the other."""
-
-    def __init__(self, problems: list[Any]) -> None:
-        self._each = [DiscreteRods([problem]) for problem in problems]
-
-    def run(self, x: Array, v: Array, held: Any, times: Array, progress: Any = None) -> list[Any]:
-        """See the base class.
-
-        Args:
-            x, v, held, times, progress: as there.
-        """
-        return [each.run(x, v, held, times, progress)[0] for each in self._each]
-
-
 def calibrate_rod(
-    scene: Scene,
-    twin: Twin,
+    scenes: Sequence[Scene],
+    twins: Sequence[Twin],
     config: CalibrationConfig,
     progress: Progress | None,
     cancelled: Callable[[], bool] | None,
     journal: Journal | None,
 ) -> FitResult:
-    """Fit a discrete rod to the training frames of ``scene``; see the module's text.
+    """Fit a discrete rod to the training frames of recordings; see the module's text.
 
     Args:
-        scene: the recording.
-        twin: with prior numbers.
+        scenes: the recordings.
+        twins: of each, with prior numbers.
         config: settings; ``max_simulations`` counts launches, ``damping`` "none" frees no friction, drag or creep.
         progress: called with (launches done, launches at most, message).
         cancelled: polled before every launch.
@@ -265,28 +86,29 @@ def calibrate_rod(
     from physworld.calibrate.global_stage import FitResult
 
     begun = time.perf_counter()
-    search = RodSearch(scene, twin, config.max_simulations, progress, cancelled)
+    pairs = [(known, _driven(known, twin)) for known, twin in zip(scenes, twins, strict=True)]
+    require_alike(twins)
+    parts = [RodSearch(*pair, config.max_simulations, progress, cancelled) for pair in pairs]
+    search = parts[0] if len(parts) == 1 else SharedRodSearch(parts)
     journal = journal or Journal()
-    if twin.drive is None:
-        twin = search.twin = replace(twin, drive=steps_seen(scene))
-    unknowns = rod_parameters(scene, twin)
     held = (*config.held, *(LOSSES if config.damping == "none" else ()))
-    unknowns = [u for u in unknowns if not u.name.startswith(held)]
-    still = 0 if twin.drive is None else int(np.searchsorted(scene.times, twin.drive[0, 0]))
-    ends = [max(4, still + round(share * (search.end - still))) for share in _WINDOWS]
+    unknowns = together(
+        [[u for u in rod_parameters(*pair) if not u.name.startswith(held)] for pair in pairs], of_a_recording
+    )
+    ends = search.windows
 
     def step(name: str, compute: Callable[[], tuple[Array, float]]) -> tuple[Array, float]:
         def counted() -> dict[str, Any]:
             theta, cost = compute()
-            return {"theta": theta.tolist(), "cost": cost, "simulations": search.simulations, "sigma": search.sigma,
+            return {"theta": theta.tolist(), "cost": cost, "simulations": search.simulations, "sigma": search.left,
                     "history": list(search.history), "cut_short": search.cut_short}  # fmt: skip
 
         kept = journal.step(name, counted)
-        search.simulations, search.sigma = kept["simulations"], kept["sigma"]
+        search.simulations, search.left = kept["simulations"], kept["sigma"]
         search.history, search.cut_short = list(kept["history"]), kept["cut_short"]
         return np.array(kept["theta"]), float("inf") if kept["cost"] is None else float(kept["cost"])
 
-    first = [u for u in unknowns if u.name in _FIRST or u.name.startswith(DRIVE)]
+    first = [u for u in unknowns if u.name in _FIRST or DRIVE in u.name]
     theta, cost = step("rod scan", lambda: _scan(search, first, ends[:2]))
     if not np.isfinite(cost):
         raise CalibrationError(
@@ -294,35 +116,33 @@ def calibrate_rod(
         )
     theta = np.array([theta[first.index(u)] if u in first else u.start for u in unknowns])
     for number, end in enumerate([*ends, *ends[-1:] * _AGAIN]):
-        before = search.sigma
+        before = np.array(search.left)
 
         def descend(place: Array = theta, end: int = end) -> tuple[Array, float]:
             found, cost = search.descend(unknowns, place, end, _STEPS)
-            residual = search.residuals([at(twin, unknowns, found)], end)[0]
-            if residual is not None:
-                search.sigma = max(scene.noise_sigma_m or 0.0, float(np.sqrt(np.mean(residual**2))), 1e-9)
+            search.settle(unknowns, found, end)
             return found, cost
 
         theta, cost = step(f"rod window {number}", descend)
-        if number >= len(ends) and search.sigma > _STEADY * before:
+        if number >= len(ends) and np.all(np.array(search.left) > _STEADY * before):
             break
-    fitted = at(twin, unknowns, theta)
-    found, correlated = _estimates(search, unknowns, theta)
-    nodes = fitted.simulate_nodes(*scene.control_track(), scene.times)
-    tracks = fitted.observe(nodes, scene.times)
+    found, correlated, agreement = _estimates(search, unknowns, theta)
+    each = [recorded(part.scene, twin_at(part.twin, unknowns, theta, k)) for k, part in enumerate(parts)]
     return FitResult(
-        twin=fitted,
-        parameters={**found, "density": _density(scene, fitted)},
+        twin=each[0].twin,
+        parameters={**found, "density": _density(scenes[0], each[0].twin)},
         searched=tuple(unknowns),
         correlations=correlated,
-        tracks=tracks,
-        particles=fitted.particles_at(nodes),
-        losses=training_losses(scene, tracks),
+        tracks=each[0].tracks,
+        particles=each[0].particles,
+        losses=each[0].losses,
         simulations=search.simulations,
         seconds=time.perf_counter() - begun,
         loss_history=list(np.minimum.accumulate(search.history)) if search.history else [],
         cut_short=search.cut_short,
         open={name: e.note for name, e in found.items() if search.cut_short},
+        recordings=tuple(each) if len(each) > 1 else (),
+        agreement=agreement,
     )
 
 
@@ -344,13 +164,15 @@ def _scan(search: RodSearch, first: list[Parameter], ends: list[int]) -> tuple[A
 
 def _estimates(
     search: RodSearch, unknowns: list[Parameter], theta: Array
-) -> tuple[dict[str, Estimate], Correlations]:
-    """Numbers with the intervals of the posterior's Gaussian about its mode."""
+) -> tuple[dict[str, Estimate], Correlations, tuple[Agreement, ...]]:
+    """Numbers with the intervals of the posterior's Gaussian about its mode, and whether recordings agree on them."""
     names = tuple(u.name for u in unknowns)
     residual, jacobian = search.linearised(unknowns, theta, search.end)
-    _, prior = _prior(unknowns, theta)
+    _, prior = off_priors(unknowns, theta)
     covariance: Array = np.diag(1.0 / prior**2)
-    if jacobian is not None:
+    agreement: tuple[Agreement, ...] = ()
+    if residual is not None and jacobian is not None:
+        agreement = () if search.cut_short else search.agreement(unknowns, theta, residual, jacobian)
         weight = 1.0 / (search.sigma**2 * search.together)
         covariance = np.linalg.inv(weight * jacobian.T @ jacobian + np.diag(prior**2))
     found = {}
@@ -365,7 +187,11 @@ def _estimates(
             found[unknown.name] = Estimate(unknown.value(float(theta[k])), unknown.unit, None, False, note)
             continue
         found[unknown.name] = Estimate(unknown.value(float(theta[k])), unknown.unit, ends, sure, note)
-    return found, Correlations(names, correlations(covariance))
+    return found, Correlations(names, correlations(covariance)), agreement
+
+
+def _driven(scene: Scene, twin: Twin) -> Twin:
+    return twin if twin.drive is not None else replace(twin, drive=steps_seen(scene))
 
 
 def _density(scene: Scene, twin: Twin) -> Estimate:
@@ -373,16 +199,3 @@ def _density(scene: Scene, twin: Twin) -> Estimate:
     return Estimate(
         twin.density, "kg/m", None, False, f"{'as declared' if declared else 'prior'}; {RATIO_NOTE}"
     )
-
-
-def _prior(unknowns: Sequence[Parameter], theta: Array) -> tuple[Array, Array]:
-    """Distances from the priors in their deviations (p,), and one over the deviations."""
-    known = [u.prior for u in unknowns]
-    means = np.array([p[0] for p in known if p is not None])
-    inverse = np.array([1.0 / p[1] for p in known if p is not None])
-    return (theta - means) * inverse, inverse
-
-
-def _within(unknowns: Sequence[Parameter], theta: Array) -> Array:
-    low, high = (np.array(ends) for ends in zip(*(u.bounds for u in unknowns), strict=True))
-    return np.clip(theta, low, high)

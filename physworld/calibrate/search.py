@@ -9,10 +9,10 @@ runner together: in this process one after the other, elsewhere at once. What is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,9 @@ from physworld.estimation.uncertain import mistaken_drives
 from physworld.estimation.unknowns import at, bounds_of
 from physworld.scene import UNDEFORMED_AT_REST, Scene
 from physworld.twin.twin import Twin
+
+if TYPE_CHECKING:
+    from physworld.calibrate.recordings import Agreement
 
 Progress = Callable[[int, int, str], None]
 
@@ -90,6 +93,25 @@ class Search:
         )  # frame 0 is the start and is not scored
         if not scene.visible[self.begin : self.end].any():
             raise CalibrationError(f"no visible point in the training frames {scene.train}")
+
+    @property
+    def twins(self) -> list[Twin]:
+        """What candidates differ from, a twin for every recording."""
+        return [self.twin]
+
+    @twins.setter
+    def twins(self, twins: list[Twin]) -> None:
+        (self.twin,) = twins
+
+    def at(self, parameters: Sequence[Parameter], theta: Array, recording: int = 0) -> Twin:
+        """The twin of a recording at a place.
+
+        Args:
+            parameters: what is searched (p).
+            theta: in the scale of the search, (p,).
+            recording: its number.
+        """
+        return at(self.twin, parameters, theta)
 
     def first_window(self) -> int:
         """End of the frames in which the points cover the first third of their training path."""
@@ -292,6 +314,10 @@ class Search:
         found = self.step("screen " + " ".join(c.name for c in candidates), measure)["gains"]
         return {name: float("nan") if gain is None else gain for name, gain in found.items()}
 
+    def agreement(self, parameters: list[Parameter], solution: Solution) -> tuple[Agreement, ...]:
+        """Whether several recordings agree on the object's numbers: of one there is nothing to be said."""
+        return ()
+
     def shift_points(self, parameters: list[Parameter], theta: Array) -> bool:
         """Move the tracked points by their mean residual: inside a solid, within a sheet and across it."""
         sigma = self.scene.noise_sigma_m
@@ -314,7 +340,7 @@ class Search:
         """Mean residual of every point in the material's frame [m], (N, 3), clipped; None where it cannot be had."""
         if not self._reaches(2 + len(parameters)):
             return None  # the search on the moved points needs a residual and a Jacobian of its own
-        twin = at(self.twin, parameters, theta)
+        twin = self.at(parameters, theta)
         times, controls = self.scene.control_track()
         try:
             nodes = twin.simulate_nodes(
@@ -378,7 +404,7 @@ class Search:
     def job(self, place: Place) -> Job:
         """The simulation of a place."""
         parameters, theta, end = place
-        return Job(at(self.twin, parameters, theta), self.end if end is None else end)
+        return Job(self.at(parameters, theta), self.end if end is None else end)
 
     def run(self, jobs: list[Job]) -> Iterator[Array | None]:
         """Tracks of simulations under this scene's controls, by the runner."""

@@ -7,7 +7,7 @@ A field that is kept belongs to the twin: whatever runs it later carries it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -28,7 +28,7 @@ GLOBAL: Stages = "global"
 
 
 def calibrate_in_stages(
-    scene: Scene,
+    scene: Scene | Sequence[Scene],
     config: CalibrationConfig | None = None,
     stages: Stages = GLOBAL,
     local: LocalConfig | None = None,
@@ -40,7 +40,7 @@ def calibrate_in_stages(
     """Fit a twin to the training frames of ``scene``, and a field over its body where that is asked for.
 
     Args:
-        scene: the recording.
+        scene: the recording, or several of one object; a field is fitted to one.
         config: settings of the global stage; None for the defaults.
         stages: "global", or "global+local".
         local: settings of the local stage; None for the defaults.
@@ -52,24 +52,39 @@ def calibrate_in_stages(
     Raises:
         CalibrationError, Cancelled, SceneUnsupported, ValueError: see :func:`physworld.calibrate.calibrate`; also
             SceneUnsupported for a field over a body without a gradient (of the updated Lagrangian form, or a mesh of
-            triangles), and ValueError for unknown stages.
+            triangles) or to several recordings, and ValueError for unknown stages.
     """
     config = config or CalibrationConfig()
     if stages not in get_args(Stages):
         raise ValueError(f"no stages {stages!r}; there are {get_args(Stages)}")
-    if stages != GLOBAL:
-        prior = prior_twin(scene, config)
-        form = prior.form
-        if not prior.lattice.smooth:
-            raise SceneUnsupported(f"the local stage needs gradients, which {prior.lattice.title} lacks")
-        if not form.supports("gradients"):
-            raise SceneUnsupported(
-                f"the local stage needs the total Lagrangian form, whose runs have a gradient; this body is of the "
-                f"{form.title} one"
-            )
-    fitted = calibrate(scene, config, progress, cancelled, journal, runner)
     if stages == GLOBAL:
-        return fitted
+        return calibrate(scene, config, progress, cancelled, journal, runner)
+    scenes = [scene] if isinstance(scene, Scene) else scene
+    if len(scenes) != 1:
+        raise SceneUnsupported(f"the local stage fits a field to one recording; these are {len(scenes)}")
+    return _with_field(scenes[0], config, local, progress, cancelled, journal, runner)
+
+
+def _with_field(
+    scene: Scene,
+    config: CalibrationConfig,
+    local: LocalConfig | None,
+    progress: Progress | None,
+    cancelled: Callable[[], bool] | None,
+    journal: Journal | None,
+    runner: Runner,
+) -> FitResult:
+    """The global stage of one recording, then a field on top of it."""
+    prior = prior_twin(scene, config)
+    form = prior.form
+    if not prior.lattice.smooth:
+        raise SceneUnsupported(f"the local stage needs gradients, which {prior.lattice.title} lacks")
+    if not form.supports("gradients"):
+        raise SceneUnsupported(
+            f"the local stage needs the total Lagrangian form, whose runs have a gradient; this body is of the "
+            f"{form.title} one"
+        )
+    fitted = calibrate(scene, config, progress, cancelled, journal, runner)
 
     def after(done: int, total: int, message: str) -> None:
         if progress is not None:

@@ -112,7 +112,7 @@ def _pipeline(site: Site, body: PipelineCreate) -> Opening:
 
 def _fit(site: Site, body: FitCreate) -> Opening:
     require_known(config=body.config)
-    return lambda session: jobs.create_fit(session, body.scene_id, body.config)
+    return lambda session: jobs.create_fit(session, body.scene_id, body.config, scene_ids=body.scene_ids)
 
 
 def _check(site: Site, body: CheckCreate) -> Opening:
@@ -270,8 +270,10 @@ def body_of(job: Job) -> dict[str, Any]:
     for reference in job.inputs:
         given.setdefault(reference.kind, []).append(reference.id)
     first: Mapping[str, str] = {kind: ids[0] for kind, ids in given.items()}
-    if job.kind in ("check", "fit"):
+    if job.kind == "check":
         return {"scene_id": first.get("scene"), "config": job.config}
+    if job.kind == "fit":
+        return {"scene_id": first.get("scene"), "scene_ids": given["scene"][1:], "config": job.config}
     if job.kind == "trace":
         own = {"fit": job.config.get("fit"), "config": job.config.get("trace")}
         return {"scene_id": first.get("scene"), "fit_id": first.get("fit"), **own}

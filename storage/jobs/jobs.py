@@ -52,12 +52,18 @@ from physworld_storage.tables import JobRow, ShardRow, columns_of, utc_now
 RUNS: dict[RunKind, rollout.RunJobs] = {"rollout": rollout.KIND, "plan": plan.KIND}
 
 
-def create_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRow | None = None) -> Job:
-    """Open a fit (its row is pending, its id is in ``outputs``). Raises NotFound.
+def create_fit(
+    session: Session,
+    scene_id: str,
+    config: FitConfig,
+    parent: JobRow | None = None,
+    scene_ids: Sequence[str] = (),
+) -> Job:
+    """Open a fit (its row is pending, its id is in ``outputs``). Raises NotFound, Conflict.
 
     Args: those of ``fit.KIND.open``.
     """
-    return _job(session, fit.KIND.open(session, scene_id, config, parent))
+    return _job(session, fit.KIND.open(session, scene_id, config, parent, scene_ids))
 
 
 def create_check(session: Session, request: CheckCreate) -> Job:

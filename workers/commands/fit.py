@@ -1,5 +1,8 @@
 """``python -m physworld_workers.commands.fit SCENE --json FILE``: calibrate a twin in this process and measure it.
 
+Several recordings of one object (``fit A B``) have one material. The figures at the top are the first one's;
+``recordings`` has the errors of each, and ``agreement`` how far each one's own optimum lies off the common one.
+
 The figures are those of :func:`fit_document`; ``--out DIR`` also keeps the twin and its prediction, the files of
 the service's fit. Ctrl-C cancels; nothing is written before the end but the finished steps, in the file of
 ``--resume``, from which the next call goes on.
@@ -32,7 +35,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="physworld fit", description="Calibrate a twin of a recording.")
-    parser.add_argument("scene", type=Path, help="folder, archive, final_data.pkl or C3D file")
+    parser.add_argument(
+        "scenes",
+        metavar="SCENE",
+        type=Path,
+        nargs="+",
+        help="folder, archive, final_data.pkl or C3D file; several: recordings of one object",
+    )
     parser.add_argument("--json", type=Path, default=None, help="write the figures to this file")
     parser.add_argument("--out", type=Path, default=None, help="folder for the twin and its prediction")
     parser.add_argument("--particles", type=count_of, default=None, help="particles of the twin, about")
@@ -78,7 +87,8 @@ def _fit(given: argparse.Namespace) -> None:
     from physworld_workers.tasks.fit_report import fit_files, fit_report
 
     _refuse_places(given)
-    scene = read_scene(given.scene)
+    scenes = [read_scene(path) for path in given.scenes]
+    scene = scenes[0]
     numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
     config = CalibrationConfig(
         **{name: value for name, value in numbers.items() if value is not None},
@@ -88,13 +98,13 @@ def _fit(given: argparse.Namespace) -> None:
         mesh=None if given.mesh is None else Mesh.read(given.mesh),
     )
     settings = f"{given.law} {config}"
-    journal = None if given.resume is None else journal_in(given.resume, scene, settings)
+    journal = None if given.resume is None else journal_in(given.resume, scenes, settings)
     with Workers(given.processes) if given.processes > 1 else nullcontext(in_turn) as runner:
         with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
             config, choice = chosen_laws(given.law, scene, config, shown, journal=journal, runner=runner)
         with progress_bar(f"fit {scene.name}") as shown:
             fitted = calibrate_in_stages(
-                scene, config, given.stages, progress=shown, journal=journal, runner=runner
+                scenes, config, given.stages, progress=shown, journal=journal, runner=runner
             )
         accuracy = not_measured("left out by --quick")
         if not given.quick:
@@ -153,6 +163,11 @@ def _print(document: dict[str, Any]) -> None:
     print(f"held-out track error [mm]{'' if floor is None else f', noise floor {1e3 * floor:.4g}'}:")
     for name, error in sorted(held_out["track_m"].items(), key=lambda item: item[1] or 0.0):
         print(f"  {name:<20} {'-' if error is None else format(1e3 * error, '.4g')}")
+    for known in document["recordings"]:
+        error, left = known["held_out"]["track_m"]["twin"], known["training"]["rms_m"]
+        print(f"  {known['scene']:<20} twin {1e3 * error:.4g}, training frames {1e3 * left:.4g} (rms)")
+    for known in document["agreement"]:
+        _print_agreement(known)
     if document["local"] is not None:
         print(f"field over the body: {document['local']['reason']}")
     law, numerics = document["law"], document["numerics"]
@@ -171,6 +186,18 @@ def _print(document: dict[str, Any]) -> None:
         shown = "" if interval is None else f" [{interval[0]:.5g}, {interval[1]:.5g}]"
         print(f"{name} without the lattice's error: {parameter['value']:.5g} {parameter['unit']}{shown}")
     print(f"{document['simulations']} simulations, {document['seconds']:.0f} s")
+
+
+def _print_agreement(known: dict[str, Any]) -> None:
+    """What every recording alone would say of a number, where it says anything."""
+    each = [
+        f"{one['scene']} {one['value']:.5g} ({one['shift_in_deviations']:+.1f} deviations)"
+        for one in known["recordings"]
+        if one["value"] is not None
+    ]
+    said = "recordings agree on" if known["agrees"] else "RECORDINGS DISAGREE ON"
+    if each:
+        print(f"{said} {known['parameter']} {known['value']:.5g} {known['unit']}: {', '.join(each)}")
 
 
 if __name__ == "__main__":

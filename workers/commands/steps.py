@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from physworld.estimation.journal import JOURNAL_BEGINS, Journal
@@ -11,8 +12,8 @@ from physworld.scene import Scene
 from physworld_scenes.bundle import canonical_archive
 
 
-def journal_in(path: Path, scene: Scene, settings: str) -> Journal:
-    """Finished steps of this scene under these settings by this engine, kept in ``path``.
+def journal_in(path: Path, scene: Scene | Sequence[Scene], settings: str) -> Journal:
+    """Finished steps of this scene, or of several, under these settings by this engine, kept in ``path``.
 
     Raises:
         ValueError: there is a file at ``path`` that no command has written: it would be lost.
@@ -27,5 +28,7 @@ def journal_in(path: Path, scene: Scene, settings: str) -> Journal:
         partial.write_text(text)
         partial.replace(path)
 
-    key = f"{hashlib.sha256(canonical_archive(scene)).hexdigest()} {engine()} {settings}"
+    scenes = [scene] if isinstance(scene, Scene) else scene
+    digests = " ".join(hashlib.sha256(canonical_archive(known)).hexdigest() for known in scenes)
+    key = f"{digests} {engine()} {settings}"
     return Journal(key, stored, save)

@@ -1,5 +1,8 @@
 """Calibrates a twin on a scene's training frames and measures it on the frames that were held out.
 
+Of several recordings of one object (``scene_ids``) all are fitted together; a law is chosen by the first, and the
+numerics are measured on it.
+
 Artifacts: ``twin.npz``, ``prediction.npz`` and ``report.json``, see :mod:`physworld_workers.tasks.fit_report`. The
 journal of the search lies in the job's scratch folder: a killed worker's fit goes on where it was, on any host.
 Simulations that do not depend on each other are shared with whatever worker is free
@@ -17,7 +20,7 @@ from physworld_workers.law_choice import chosen_laws
 from physworld_workers.lineage import lineage_of
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.fit_accuracy import fit_accuracy, not_measured
-from physworld_workers.tasks.fit_report import MEDIA_TYPES, fit_files, fit_report
+from physworld_workers.tasks.fit_report import fit_files, fit_report, media_type
 from physworld_workers.tasks.inputs import scene_of, scene_reference
 from physworld_workers.tasks.shared_runs import SharedRunner, stored_journal
 
@@ -36,7 +39,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         helpers.call_off(session, context.lease.job_id)  # those of an attempt that was lost
     payload = context.lease.payload
     config = FitConfig.model_validate(payload["config"])
-    scene = scene_of(stores, payload["scene_id"])
+    scene_ids = [payload["scene_id"], *payload.get("scene_ids", ())]
+    scenes = [scene_of(stores, known) for known in scene_ids]
+    scene = scenes[0]
 
     usual = min(USUAL_SIMULATIONS, config.max_simulations)
     context.plan({SEARCH: usual, NUMERICS: NUMERICS_SIMULATIONS if config.numerics else 0.0})
@@ -61,7 +66,14 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         config.law, scene, calibration, progress, context.cancelled, journal, runner
     )
     fitted = calibrate_in_stages(
-        scene, calibration, config.stages, None, progress, context.cancelled, journal, runner
+        scenes,
+        calibration,
+        config.stages,
+        None,
+        progress,
+        context.cancelled,
+        journal,
+        runner,
     )
     accuracy = not_measured("left out by the request")
     if config.numerics:
@@ -76,7 +88,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     context.check()
     report = fit_report(scene, fitted, law, accuracy)
     artifacts = [
-        stores.artifacts.put_bytes(content, name, MEDIA_TYPES[name])
+        stores.artifacts.put_bytes(content, name, media_type(name))
         for name, content in fit_files(scene, fitted, report).items()
     ]
     result = {
@@ -84,7 +96,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         "metrics": {**report["metrics"], "notes": report["notes"]},
         "artifacts": [artifact.model_dump(mode="json") for artifact in artifacts],
         "seconds": fitted.seconds,
-        "lineage": lineage_of([scene_reference(stores, payload["scene_id"])], payload["config"], {}),
+        "lineage": lineage_of([scene_reference(stores, known) for known in scene_ids], payload["config"], {}),
     }
     context.check()
     return HandlerResult(result, artifacts[0].sha256)

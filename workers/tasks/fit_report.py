@@ -2,13 +2,15 @@
 
 Files: ``twin.npz`` (the twin, see ``Twin.to_arrays``), ``prediction.npz`` (``times`` (T,) f8 [s], ``tracks``
 (T, N, 3) f4 [m], ``particles`` (T, P', 3) f4 [m] with P' at most 1500, ``particle_indices`` (P',)),
-``report.json`` (parameters, metrics, notes).
+``report.json`` (parameters, metrics, notes). Of several recordings these are the first one's; the twin and the
+prediction of the k-th are ``twin_k.npz`` and ``prediction_k.npz``, k from 2.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -19,6 +21,7 @@ from physworld.calibrate import Estimate, FitResult
 from physworld.calibrate.law_choice import LawChoice
 from physworld.calibrate.local_search import FIELDS
 from physworld.calibrate.local_stage import LocalResult
+from physworld.calibrate.recordings import Agreement, Recorded
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene
 from physworld_schemas.fit import Parameter
@@ -27,7 +30,11 @@ from physworld_workers.tasks.inputs import TWIN, npz_bytes
 PREDICTION = "prediction.npz"
 REPORT = "report.json"
 SHOWN_PARTICLES = 1500
-MEDIA_TYPES = {TWIN: "application/x-npz", PREDICTION: "application/x-npz", REPORT: "application/json"}
+
+
+def media_type(name: str) -> str:
+    """Of a file of a fit."""
+    return "application/json" if name == REPORT else "application/x-npz"
 
 
 def fit_report(
@@ -36,7 +43,7 @@ def fit_report(
     """``parameters``, ``metrics`` and ``notes`` as plain JSON; a number that is not finite is None.
 
     Args:
-        scene: the recording.
+        scene: the recording, of several the first.
         fitted: its calibration.
         law: how the law was chosen; None: it is the usual one.
         accuracy: of :func:`physworld_workers.tasks.fit_accuracy.fit_accuracy`.
@@ -59,6 +66,8 @@ def fit_report(
         "formulation": {"name": fitted.twin.formulation, "reason": _formulation_reason(fitted)},
         "local": _local_record(fitted.local),
         "search": {"converged": not open_ones, "open": open_ones},
+        "recordings": [_of_recording(known) for known in fitted.recordings],
+        "agreement": [_agreement(known, fitted.recordings) for known in fitted.agreement],
         **accuracy,
     }
     return {
@@ -70,18 +79,48 @@ def fit_report(
 
 def fit_files(scene: Scene, fitted: FitResult, report: dict[str, Any]) -> dict[str, bytes]:
     """The files by name, the twin first."""
-    count = fitted.particles.shape[1]
-    shown = np.unique(np.linspace(0, count - 1, min(count, SHOWN_PARTICLES)).round().astype(np.int64))
-    prediction = {
-        "times": scene.times,
-        "tracks": fitted.tracks.astype(np.float32),
-        "particles": fitted.particles[:, shown].astype(np.float32),
-        "particle_indices": shown,
-    }
-    return {
+    found = {
         TWIN: npz_bytes(fitted.twin.to_arrays()),
-        PREDICTION: npz_bytes(prediction),
+        PREDICTION: _prediction(scene, fitted),
         REPORT: json.dumps(report, indent=1, allow_nan=False).encode(),
+    }
+    for number, known in enumerate(fitted.recordings[1:], 2):
+        found[TWIN.replace(".", f"_{number}.")] = npz_bytes(known.twin.to_arrays())
+        found[PREDICTION.replace(".", f"_{number}.")] = _prediction(known.scene, known)
+    return found
+
+
+def _prediction(scene: Scene, predicted: FitResult | Recorded) -> bytes:
+    count = predicted.particles.shape[1]
+    shown = np.unique(np.linspace(0, count - 1, min(count, SHOWN_PARTICLES)).round().astype(np.int64))
+    return npz_bytes(
+        {
+            "times": scene.times,
+            "tracks": predicted.tracks.astype(np.float32),
+            "particles": predicted.particles[:, shown].astype(np.float32),
+            "particle_indices": shown,
+        }
+    )
+
+
+def _of_recording(known: Recorded) -> dict[str, Any]:
+    """Errors of one of several recordings, without the curves."""
+    held_out = held_out_table(known.scene, {"twin": known.tracks})
+    del held_out["per_frame"]
+    return {"scene": known.scene.name, "held_out": held_out, "training": known.losses}
+
+
+def _agreement(known: Agreement, recordings: Sequence[Recorded]) -> dict[str, Any]:
+    """How far the own optimum of every recording lies off the common one."""
+    each = zip(recordings, known.own, known.shifts, strict=True)
+    return {
+        "parameter": known.name,
+        "unit": known.unit,
+        "value": known.value,
+        "agrees": known.agrees,
+        "recordings": [
+            {"scene": one.scene.name, "value": own, "shift_in_deviations": shift} for one, own, shift in each
+        ],
     }
 
 

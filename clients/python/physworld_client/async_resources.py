@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 
 import httpx
@@ -99,10 +99,13 @@ class AsyncFits(AsyncListed):
 
     resource = "fits"
 
-    async def create(self, scene_id: str, config: FitConfig | None = None) -> Job:
-        """Starts a fit; its job's output is the fit."""
+    async def create(
+        self, scene_id: str, config: FitConfig | None = None, *, scene_ids: Sequence[str] = ()
+    ) -> Job:
+        """Starts a fit; its job's output is the fit. ``scene_ids``: further recordings of the object, fitted too."""
         scene = await self._client.scenes.id_of(scene_id)
-        return await self._client.send(calls.fit_create(scene, config))
+        further = [await self._client.scenes.id_of(one) for one in scene_ids]
+        return await self._client.send(calls.fit_create(scene, config, further))
 
     async def get(self, fit_id: str) -> Fit:
         """One fit."""
@@ -336,7 +339,9 @@ class AsyncPipelines(AsyncResource):
         """Starts fit, dataset and training; from a full body, or with the defaults for a scene."""
         asked = calls.pipeline_body(body, scene_id)
         scene = await self._client.scenes.id_of(asked.scene_id)
-        return await self._client.send(calls.pipeline_create(asked.model_copy(update={"scene_id": scene})))
+        further = [await self._client.scenes.id_of(one) for one in asked.scene_ids]
+        named = asked.model_copy(update={"scene_id": scene, "scene_ids": further})
+        return await self._client.send(calls.pipeline_create(named))
 
 
 class AsyncJobs(AsyncListed):

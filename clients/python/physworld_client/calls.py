@@ -139,9 +139,14 @@ def scene_list(
     return Call("GET", "/v1/scenes", _SCENES, query=_given(limit=limit, cursor=cursor, kind=kind, tag=tag))
 
 
-def fit_create(scene_id: str, config: FitConfig | None) -> Call[Job]:
+def fit_create(scene_id: str, config: FitConfig | None, scene_ids: Sequence[str] = ()) -> Call[Job]:
     """POST /v1/fits."""
-    return Call("POST", "/v1/fits", _JOB, body=FitCreate(scene_id=scene_id, config=config or FitConfig()))
+    return Call(
+        "POST",
+        "/v1/fits",
+        _JOB,
+        body=FitCreate(scene_id=scene_id, scene_ids=list(scene_ids), config=config or FitConfig()),
+    )
 
 
 def fit_get(fit_id: str) -> Call[Fit]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import httpx
@@ -98,10 +98,11 @@ class Fits(Listed):
 
     resource = "fits"
 
-    def create(self, scene_id: str, config: FitConfig | None = None) -> Job:
-        """Starts a fit; its job's output is the fit."""
+    def create(self, scene_id: str, config: FitConfig | None = None, *, scene_ids: Sequence[str] = ()) -> Job:
+        """Starts a fit; its job's output is the fit. ``scene_ids``: further recordings of the object, fitted too."""
         scene = self._client.scenes.id_of(scene_id)
-        return self._client.send(calls.fit_create(scene, config))
+        further = [self._client.scenes.id_of(one) for one in scene_ids]
+        return self._client.send(calls.fit_create(scene, config, further))
 
     def get(self, fit_id: str) -> Fit:
         """One fit."""
@@ -333,7 +334,9 @@ class Pipelines(Resource):
         """Starts fit, dataset and training; from a full body, or with the defaults for a scene."""
         asked = calls.pipeline_body(body, scene_id)
         scene = self._client.scenes.id_of(asked.scene_id)
-        return self._client.send(calls.pipeline_create(asked.model_copy(update={"scene_id": scene})))
+        further = [self._client.scenes.id_of(one) for one in asked.scene_ids]
+        named = asked.model_copy(update={"scene_id": scene, "scene_ids": further})
+        return self._client.send(calls.pipeline_create(named))
 
 
 class Jobs(Listed):

@@ -24,7 +24,10 @@ def create_fit(body: FitCreate, idempotency: IdempotencyDep) -> Response:
     """Start a calibration; the fit's id is in the job's `outputs`."""
     require_known(config=body.config)
     return idempotency.run(
-        body, lambda session: accepted(jobs.create_fit(session, body.scene_id, body.config))
+        body,
+        lambda session: accepted(
+            jobs.create_fit(session, body.scene_id, body.config, scene_ids=body.scene_ids)
+        ),
     )
 
 

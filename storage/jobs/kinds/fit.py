@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -49,28 +50,44 @@ class FitJobs(JobKind):
     )
 
     def open(
-        self, session: Session, scene_id: str, config: FitConfig, parent: JobRow | None = None
+        self,
+        session: Session,
+        scene_id: str,
+        config: FitConfig,
+        parent: JobRow | None = None,
+        scene_ids: Sequence[str] = (),
     ) -> JobRow:
-        """A fit of a scene. Raises NotFound.
+        """A fit of a scene. Raises NotFound, or Conflict where another scene shows another kind of object.
 
         Args:
             session: the transaction that it belongs to.
             scene_id: of a stored scene.
             config: its settings.
             parent: the pipeline that it belongs to.
+            scene_ids: further recordings of the object, fitted together with the first.
         """
-        scene = scene_row(session, scene_id)
+        scenes = [scene_row(session, known) for known in (scene_id, *scene_ids)]
+        for scene in scenes[1:]:
+            if scene.kind != scenes[0].kind:
+                raise Conflict(
+                    f"recordings of one object have one kind: scene {scene_id} shows a {scenes[0].kind}, "
+                    f"{scene.id} a {scene.kind}"
+                )
         fit_id = new_id("fit")
         job = self.queued(
             session,
             total=config.max_simulations,
-            inputs=[Reference(kind="scene", id=scene_id, digest=scene.digest)],
+            inputs=[Reference(kind="scene", id=scene.id, digest=scene.digest) for scene in scenes],
             output_id=fit_id,
             config=config.model_dump(mode="json"),
             parent=parent,
         )
-        row = FitRow(id=fit_id, scene_id=scene_id, config=job.config, parameters={}, metrics={}, artifacts=[])
-        return self.begin(session, job, row, {"fit_id": fit_id, "scene_id": scene_id, "config": job.config})
+        others = {"scene_ids": list(scene_ids)}
+        row = FitRow(
+            id=fit_id, scene_id=scene_id, config=job.config, parameters={}, metrics=others, artifacts=[]
+        )
+        payload = {"fit_id": fit_id, "scene_id": scene_id, **others, "config": job.config}
+        return self.begin(session, job, row, payload)
 
     def seconds(self, config: dict[str, Any]) -> float:
         """By its particles; most searches end before their budget is spent."""

@@ -22,10 +22,10 @@ from sqlalchemy.orm import Session
 from physworld_schemas.assessment import AssessmentCreate
 from physworld_schemas.base import Reference, Unmade
 from physworld_schemas.dataset import DatasetConfig
-from physworld_schemas.fit import FitConfig
+from physworld_schemas.fit import MOST_RECORDINGS, FitConfig
 from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import TrainingConfig, TrainingCreate
-from physworld_schemas.trace import MOST_RECORDINGS, NO_OTHER_PHYSICS, TRACE_PARTICLES
+from physworld_schemas.trace import NO_OTHER_PHYSICS, TRACE_PARTICLES
 from physworld_storage.errors import Conflict
 from physworld_storage.jobs.kind import JobKind, output_of, scene_row
 from physworld_storage.jobs.kinds import assessment, dataset, trace, training
@@ -183,16 +183,16 @@ def _require_traceable(session: Session, model: ModelVersionRow, scene: SceneRow
     others = _others(session, model, scene.id)
     if len(others) > MOST_RECORDINGS:
         raise Conflict(
-            f"version {model.version} of {model.name} comes from a trace of {len(others)} recordings; with scene "
+            f"version {model.version} of {model.name} comes from {len(others)} recordings; with scene "
             f"{scene.id} they are more than {MOST_RECORDINGS + 1}"
         )
 
 
 def _others(session: Session, model: ModelVersionRow, scene_id: str) -> list[str]:
-    """What is traced together with the fit's recording: what the version's own trace had, and the new one."""
-    known: list[str] = []
+    """What is traced with the fit's first recording: what the version's fit and trace had too, and the new one."""
+    known = list(session.get_one(FitRow, model.fit_id).metrics.get("scene_ids", ()))
     if model.trace_id is not None:
-        known = list(trace_row(session, model.trace_id).report.get("scene_ids", ()))
+        known += trace_row(session, model.trace_id).report.get("scene_ids", ())
     return list(dict.fromkeys([*known, scene_id]))
 
 

@@ -51,11 +51,14 @@ class PipelineJobs(JobKind):
         job = self.queued(
             session,
             total=100,
-            inputs=[Reference(kind="scene", id=scene.id, digest=scene.digest)],
+            inputs=[
+                Reference(kind="scene", id=known, digest=scene_row(session, known).digest)
+                for known in (request.scene_id, *request.scene_ids)
+            ],
             output_id=None,
             config=request.model_copy(update={"model_name": name}).model_dump(mode="json"),
         )
-        fit.KIND.open(session, scene.id, request.fit, parent=job)
+        fit.KIND.open(session, scene.id, request.fit, job, request.scene_ids)
         return job
 
     def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
@@ -76,7 +79,15 @@ class PipelineJobs(JobKind):
         if last == FIT and request.close_the_loop:
             particles = min(request.fit.particle_budget, TRACE_PARTICLES)
             declared = request.fit.model_copy(update={"damping": "none", "particle_budget": particles})
-            trace.KIND.open(session, request.scene_id, declared, request.trace, outputs[FIT], parent=parent)
+            trace.KIND.open(
+                session,
+                request.scene_id,
+                declared,
+                request.trace,
+                outputs[FIT],
+                parent=parent,
+                scene_ids=request.scene_ids,
+            )
         elif last == DATASET:
             _open_training(session, parent, request, outputs[DATASET])
         elif last == TRAINING and not _is_comparison(session, children):

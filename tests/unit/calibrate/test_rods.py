@@ -56,7 +56,7 @@ def fit(
     """A calibration that is cancelled as soon as there is something in ``stopped``."""
     scene = recorded()
     return calibrate_rod(
-        scene, prior_twin(scene, config), config, None, lambda: bool(stopped), journal or Journal()
+        [scene], [prior_twin(scene, config)], config, None, lambda: bool(stopped), journal or Journal()
     )
 
 

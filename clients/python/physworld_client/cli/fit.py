@@ -1,4 +1,4 @@
-"""``physworld fit SCENE``: calibrate a twin without the service.
+"""``physworld fit SCENE``: calibrate a twin without the service; ``physworld fit A B``: of several recordings.
 
 This process becomes the command (``python -m physworld_workers.commands.fit``), so that Ctrl-C reaches exactly one
 process, its exit code is this one's, and the client imports no engine.
@@ -21,7 +21,13 @@ MODULE = "physworld_workers.commands.fit"
 
 
 def fit(
-    scene: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or C3D file.")],
+    scenes: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SCENE...",
+            help="Folder, archive, final_data.pkl or C3D file; several are recordings of one object.",
+        ),
+    ],
     json: Annotated[
         Path | None, typer.Option(callback=JSON_FILE, help="Write the figures to this file.")
     ] = None,
@@ -73,7 +79,7 @@ def fit(
         "--resume": resume,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
-    become(MODULE, [*options, *(["--quick"] if quick else []), "--", str(scene)])
+    become(MODULE, [*options, *(["--quick"] if quick else []), "--", *map(str, scenes)])
 
 
 def become(module: str, arguments: list[str]) -> None:

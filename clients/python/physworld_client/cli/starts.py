@@ -45,6 +45,7 @@ class Start:
         arguments: what it works on: (parameter, resource that it names one of; empty: a text of its own).
         create: of the client, the arguments in their order and the settings, to the job.
         chosen: options that name an object: (option, resource, help).
+        repeated: repeatable options that name one each: (parameter, option, resource, help).
     """
 
     group: str
@@ -54,10 +55,11 @@ class Start:
     arguments: tuple[tuple[str, str], ...]
     create: Callable[..., Job]
     chosen: tuple[tuple[str, str, str], ...] = field(default=())
+    repeated: tuple[tuple[str, str, str, str], ...] = field(default=())
 
 
-def _fit(client: Client, given: dict[str, str], config: FitConfig) -> Job:
-    return client.fits.create(given["scene_id"], config)
+def _fit(client: Client, given: dict[str, Any], config: FitConfig) -> Job:
+    return client.fits.create(given["scene_id"], config, scene_ids=given["scene_ids"])
 
 
 def _dataset(client: Client, given: dict[str, str], config: DatasetConfig) -> Job:
@@ -76,7 +78,17 @@ def _video(client: Client, given: dict[str, str], config: VideoConfig) -> Job:
 
 TRACE = ("trace", "traces", "A ready trace, whose effects the demonstrations carry.")
 STARTS = (
-    Start("fits", "add", "Calibrate a twin of a scene.", FitConfig, (("scene_id", "scenes"),), _fit),
+    Start(
+        "fits",
+        "add",
+        "Calibrate a twin of a scene, or of several recordings of one object.",
+        FitConfig,
+        (("scene_id", "scenes"),),
+        _fit,
+        repeated=(
+            ("scene_ids", "--with", "scenes", "Another recording of the object, fitted with it; repeatable."),
+        ),
+    ),
     Start(
         "datasets",
         "add",
@@ -117,6 +129,8 @@ def _add(start: Start) -> None:
     }
     for name, resource, text in start.chosen:
         options[name] = (Annotated[str | None, typer.Option(help=text), *_marks(resource)], None)
+    for name, option, _, text in start.repeated:
+        options[name] = (Annotated[list[str] | None, typer.Option(option, help=text)], None)
     options |= settings
     options["config"] = (
         Annotated[Path | None, typer.Option(help="Settings as JSON; options count before it.")],
@@ -129,7 +143,11 @@ def _add(start: Start) -> None:
         chosen = {name: given[name] for name in settings if given[name] is not None}
         config = start.config.model_validate({**_read(given["config"]), **chosen})
         named = [name for name, _ in start.arguments] + [name for name, _, _ in start.chosen]
-        job = start.create(client, {name: given[name] for name in named}, config)
+        several = {
+            name: [found(client, resource, one) for one in given[name] or ()]
+            for name, _, resource, _ in start.repeated
+        }
+        job = start.create(client, {**{name: given[name] for name in named}, **several}, config)
         if not given["json"]:
             made = f"{job.outputs[0].id} is {job.state}, " if job.outputs else ""
             stdout.print(f"{made}job {job.id}", markup=False)
