@@ -58,8 +58,8 @@ def gripped(recipe: Recipe, t: float) -> np.ndarray:
     return np.array([x, y, z])
 
 
-def simulate(recipe: Recipe, frames: int = FRAMES) -> np.ndarray:
-    """Places of the masses at every frame, (frames, masses, 3) [m]."""
+def simulate(recipe: Recipe, frames: int = FRAMES, drag_per_s: float = 0.0) -> np.ndarray:
+    """Places of the masses at every frame, (frames, masses, 3) [m], perhaps in air: a = -c v."""
     n, spacing = recipe.masses, recipe.length_m / (recipe.masses - 1)
     rest = np.zeros((n, 3))
     rest[:, 2] = recipe.top_m - spacing * np.arange(n)
@@ -85,6 +85,8 @@ def simulate(recipe: Recipe, frames: int = FRAMES) -> np.ndarray:
         force[1:-1] += 2.0 * moment
         force[2:] -= moment
         v = v + dt * force / mass
+        if drag_per_s:
+            v -= dt * drag_per_s * v
         shift, before = gripped(recipe, step * dt), gripped(recipe, (step - 1) * dt)
         v[held] = (shift - before) / dt
         x = x + dt * v

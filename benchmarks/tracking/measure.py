@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.tracking.plays import MARKER_ID
 from physworld.arrays import Array
+from physworld.geometry.rigid import least_rotation
 from physworld.scene import Scene
 from physworld.tracking.mask import Box
 from physworld_scenes.importers.gripping import GripFrom
@@ -69,8 +70,8 @@ def scene_of(folder: Path) -> tuple[Scene, float]:
 def score(folder: Path, scene: Scene, seconds: float) -> Score:
     """The scene against the recording's truth."""
     truth = np.load(folder / "truth.npz")
-    vertices, triangles = truth["vertices"].astype(np.float64), truth["triangles"]
-    exact = followed_exactly(vertices, triangles, scene.points[0])
+    vertices = truth["vertices"].astype(np.float64)
+    exact = exact_tracks(folder, scene)
     error = np.linalg.norm(scene.points - exact, axis=2) * MILLIMETRES
     error[~scene.visible] = np.nan
     alive = scene.visible.mean(axis=1)
@@ -105,6 +106,41 @@ def covered(surface: Array, scene: Scene, frame: int) -> float:
     """Share of the surface's vertices (V, 3) [m] of a frame with a seen point nearby."""
     distance, _ = cKDTree(scene.points[frame, scene.visible[frame]]).query(surface)
     return float((distance < NEAR_M).mean())
+
+
+def exact_tracks(folder: Path, scene: Scene) -> Array:
+    """True tracks (T, N, 3) [m] of the material points that a scene of a rendered recording follows."""
+    truth = np.load(folder / "truth.npz")
+    if "line" not in truth:
+        return followed_exactly(truth["vertices"].astype(np.float64), truth["triangles"], scene.points[0])
+    poses = np.array(json.loads((folder / "calibrate.json").read_text()))
+    eyes = poses[scene.extra_arrays["tracked_by_camera"], :3, 3]
+    return beside_line(truth["line"].astype(np.float64), scene.points[0], eyes)
+
+
+def beside_line(line: Array, places: Array, eyes: Array) -> Array:
+    """Tracks (T, N, 3) [m] of points beside a rope's middle line, carried by its sections without twist.
+
+    A camera tells how far beside the line a point is, across the line and its own ray; along the ray it is on the line.
+
+    Args:
+        line: (T, n, 3) [m].
+        places: measured in the first frame, (N, 3) [m].
+        eyes: where their cameras stand, (N, 3) [m].
+    """
+    pieces = np.diff(line[0], axis=0)
+    share = np.einsum("nsi,si->ns", places[:, None] - line[0][None, :-1], pieces) / (pieces**2).sum(axis=1)
+    share = np.clip(share, 0.0, 1.0)
+    on_each = line[0][None, :-1] + share[..., None] * pieces
+    own = np.argmin(np.linalg.norm(on_each - places[:, None], axis=2), axis=1)
+    rows = np.arange(len(places))
+    part = share[rows, own][None, :, None]
+    middle = (1.0 - part) * line[:, own] + part * line[:, own + 1]
+    along = line[:, own + 1] - line[:, own]
+    beside = np.cross(along[0], places - eyes)
+    beside /= np.linalg.norm(beside, axis=1, keepdims=True)
+    offset = beside * ((places - middle[0]) * beside).sum(axis=1, keepdims=True)
+    return middle + np.einsum("tnij,nj->tni", least_rotation(along[:1], along), offset)
 
 
 def followed_exactly(vertices: Array, triangles: Array, places: Array) -> Array:

@@ -23,7 +23,7 @@ from physworld.camera import Camera, look_at
 from scripts import make_sample_rope, make_sample_scene
 
 FPS, FRAMES = 30.0, 90
-CONVERGED_PA, BAR_ELEMENTS, BAR_DRAG_PER_S = 2.85e5, (8, 2, 2), 1.0
+CONVERGED_PA, BAR_ELEMENTS, DRAG_PER_S = 2.85e5, (8, 2, 2), 1.0
 MARKER_SIDE_M = 0.05
 """Of the marker itself; the plate that it is printed on is a fifth wider on every side."""
 MARKER_ID = 7
@@ -43,11 +43,12 @@ class Play:
         object_vertices: how many of them are the object's.
         cameras: the first is the one that a recording with one camera has.
         table_m: height of the table [m].
-        box_px: around the object in the first camera's first picture, left, top, right, bottom.
         declared: what a person knows: keys of ``scene.json``.
         truth: what nobody tells the tracker.
         grip_poses: rotation and shift at every frame, (T, 3, 3) and (T, 3).
         grip_centre: what the gripper turns about, at rest, (3,) [m].
+        box_px: around the object in the first camera's first picture, left, top, right, bottom.
+        line: of a rope, its middle at every frame, (T, n, 3) [m].
     """
 
     kind: str
@@ -61,6 +62,7 @@ class Play:
     grip_poses: tuple[Array, Array]
     grip_centre: Array
     box_px: tuple[int, int, int, int] = field(default=(0, 0, 0, 0))
+    line: Array | None = None
 
     @property
     def triangles(self) -> Array:
@@ -142,35 +144,53 @@ def _held_beam(surface: Surface, positions: Array, truth: dict[str, Any]) -> Pla
     )  # fmt: skip
 
 
-def rope(frames: int = FRAMES) -> Play:
-    """A rope that hangs from a gripper, swayed and lifted."""
-    recipe = replace(make_sample_rope.Recipe(), radius_m=0.006)
-    path = make_sample_rope.simulate(recipe, frames)
+def rope(frames: int = FRAMES, drag_per_s: float = 0.0) -> Play:
+    """A soft round cord that hangs from a gripper, swayed and lifted, perhaps in air that nobody declares: a = -c v.
+
+    One homogeneous section stretches and bends. It is stiff enough that what bends below the jaws, sqrt(E I / T) long
+    for the tension T, spans many masses. A chain whose masses are held bends from half a spacing before the last of
+    them on: there the jaws end.
+    """
+    recipe = replace(
+        make_sample_rope.Recipe(), masses=121, held=5, radius_m=0.006, bending_n_m2=5e-4, stretching_n=55.0,
+        bend_dashpot_n_m2_s=1e-8, stretch_dashpot_n_s=5e-3, steps_per_frame=1200,
+    )  # fmt: skip
+    path = make_sample_rope.simulate(recipe, frames, drag_per_s)
     around = 12
     tube = np.stack([tube_around(line, recipe.radius_m, around) for line in path])
     triangles = tube_triangles(recipe.masses, around)
     top = np.array([0.0, 0.0, recipe.top_m])
+    held = (recipe.held - 1.5) * recipe.length_m / (recipe.masses - 1)
     jaws = [
-        box([-0.02, -0.014, recipe.top_m - 0.02], [-0.006, 0.014, recipe.top_m + 0.02]),
-        box([0.006, -0.014, recipe.top_m - 0.02], [0.02, 0.014, recipe.top_m + 0.02]),
+        box([-0.02, -0.014, recipe.top_m - held], [-0.006, 0.014, recipe.top_m + 0.02]),
+        box([0.006, -0.014, recipe.top_m - held], [0.02, 0.014, recipe.top_m + 0.02]),
     ]
     plate = plate_at([0.06, -0.016, recipe.top_m + 0.01])
     declared = {
-        "body": {"length_m": recipe.length_m, "radius_m": recipe.radius_m},
+        "body": {
+            "length_m": recipe.length_m,
+            "radius_m": recipe.radius_m,
+            "mass_kg": recipe.length_m * recipe.density_kg_m,
+        },
         "grip": {
-            "region_min_m": [-0.01, -0.01, recipe.top_m - 0.0201],
+            "region_min_m": [-0.01, -0.01, recipe.top_m - held],
             "region_max_m": [0.01, 0.01, recipe.top_m + 0.01],
         },
     }
-    truth = {"stretching_n": recipe.stretching_n, "bending_n_m2": recipe.bending_n_m2}
+    truth = {
+        "stretching_n": recipe.stretching_n,
+        "bending_n_m2": recipe.bending_n_m2,
+        "air_drag_per_s": drag_per_s,
+    }
 
     def pose(t: float) -> tuple[Array, Array]:
         return np.eye(3), make_sample_rope.gripped(recipe, t)
 
-    return _play(
+    play = _play(
         "rope", Surface(triangles, tube[0], grain_m=0.004), tube, jaws, plate, pose, top, declared, truth,
         target=(0.0, 0.0, 0.78), distance=1.05, table_m=0.2,
     )  # fmt: skip
+    return replace(play, line=path)
 
 
 def cloth(frames: int = FRAMES) -> Play:
@@ -222,8 +242,9 @@ def cloth(frames: int = FRAMES) -> Play:
 PLAYS = {
     "beam": beam,
     "bar": bar,
-    "bar_in_air": partial(bar, drag_per_s=BAR_DRAG_PER_S),
+    "bar_in_air": partial(bar, drag_per_s=DRAG_PER_S),
     "rope": rope,
+    "rope_in_air": partial(rope, drag_per_s=DRAG_PER_S),
     "cloth": cloth,
 }
 

@@ -70,6 +70,7 @@ def render(play: Play, folder: Path, cameras: int = 1, seed: int = 0) -> None:
         grip_turns=play.grip_poses[0],
         grip_shifts=play.grip_poses[1],
         grip_centre=play.grip_centre,
+        **({} if play.line is None else {"line": play.line.astype(np.float32)}),
     )
     facts = {"kind": play.kind, "box_px": play.box_px, "declared": play.declared, "truth": play.truth}
     (folder / "truth.json").write_text(json.dumps(facts, indent=1) + "\n")

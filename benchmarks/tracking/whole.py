@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.tracking.measure import followed_exactly, scene_of
+from benchmarks.tracking.measure import exact_tracks, scene_of
 from physworld.arrays import Array
 from physworld.calibrate import CalibrationConfig, FitResult, calibrate
 from physworld.calibrate.discretisation import converged_parameters
@@ -95,12 +95,11 @@ def named(folder: Path, particles: int) -> dict[str, Any]:
 def exactly(folder: Path, scene: Scene) -> Scene:
     """The imported scene with the exact tracks of its points and the exact way of its gripper."""
     truth = np.load(folder / "truth.npz")
-    tracks = followed_exactly(truth["vertices"].astype(np.float64), truth["triangles"], scene.points[0])
     centre = truth["grip_centre"]
     turned = np.einsum("tij,kj->tki", truth["grip_turns"], scene.controllers[0] - centre)
     return replace(
         scene,
-        points=tracks,
+        points=exact_tracks(folder, scene),
         controllers=turned + centre + truth["grip_shifts"][:, None],
         controller_errors_m=None,
         noise_covariance_m2=None,

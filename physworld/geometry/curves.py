@@ -14,6 +14,7 @@ from scipy.sparse.linalg import spsolve
 from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.errors import SceneUnsupported
+from physworld.geometry.shown import cloud_of_start, reach_along, spacing_of
 from physworld.scene import Scene
 
 _VELOCITY_WINDOW_S = 0.06  # frames within this time of the first give the start's velocity
@@ -23,6 +24,7 @@ _BENDING_WEIGHT = (
 )
 _STRETCH_WEIGHT = 0.3
 _GAUSS_NEWTON_STEPS = 12
+_BESIDE = 3.0  # median distances from a rod's axis: what of its cloud lies farther is none of it
 _LONGER = 1.02  # times the extent of a straight rod's points: a declared length beyond it reaches past them
 
 
@@ -59,8 +61,9 @@ def straight_extent(
 ) -> tuple[float, float]:
     """Where a straight rod begins along ``direction`` from ``centre``, and its length [m].
 
-    Its points (at ``along``) show it whole, unless a longer one is declared: then it reaches back to where it is held,
-    and the rest of it past its last point; one that nobody holds reaches as far past its first.
+    A cloud of the first frame shows its free end (:mod:`physworld.geometry.shown`). Without one its points (at
+    ``along``) show it whole, unless a longer one is declared: then it reaches back to where it is held, and the rest of
+    it past its last point; one that nobody holds reaches as far past its first.
 
     Args:
         scene: its declared length and its controllers are used.
@@ -69,7 +72,17 @@ def straight_extent(
         notes: takes a sentence where the rod reaches past its points.
     """
     begin, length = float(along.min()), float(np.ptp(along))
-    declared = scene.body.length_m
+    declared, cloud = scene.body.length_m, cloud_of_start(scene)
+    if cloud is not None:
+        off = cloud - centre
+        beside = np.linalg.norm(off - np.outer(off @ direction, direction), axis=1)
+        near = beside < _BESIDE * np.median(beside)
+        reach = reach_along(
+            off[near] @ direction, declared, (scene.controllers[0] - centre) @ direction, spacing_of(cloud)
+        )
+        if reach is not None:
+            notes.append(f"the cloud of the first frame shows its ends: {reach[1]:.4g} m long")
+            return reach
     if declared is None or scene.rest_volume_points is not None or declared <= _LONGER * length:
         return begin, length
     missing, held = declared - length, (scene.controllers[0] - centre) @ direction

@@ -14,6 +14,7 @@ from physworld.geometry.body import ReferenceBody, first_points
 from physworld.geometry.curves import fit_nodes
 from physworld.geometry.declared import grips_of
 from physworld.geometry.hung_sheet import hangs_from_a_bar, hung_sheet
+from physworld.geometry.shown import cloud_of_start, reach_along, spacing_of
 from physworld.scene import Grip, Scene
 
 SHEET_KINDS = ("sheet", "cloth")
@@ -66,6 +67,7 @@ def sheet_body(
         origin, axes, size, off_plane = plane_of(scene, points)
         if off_plane > _FLAT * size.min():
             return None
+        origin, size = _as_shown(scene, origin, axes, size)
         material = ((points - origin) @ axes.T)[:, :2]
         flat_map = (origin, axes)
     lattice: Lattice
@@ -128,6 +130,30 @@ def _declared_extent(scene: Scene, flat_map: tuple[Array, Array] | None, size: A
         if len(ends):
             begin[axis] = ends[np.argmin(np.abs(ends - begin[axis]))]
     return begin, sides
+
+
+def _as_shown(scene: Scene, origin: Array, axes: Array, size: Array) -> tuple[Array, Array]:
+    """Corner (3,) and sides (2,) [m] by the cloud of the first frame, as given where there is none.
+
+    Args:
+        origin, axes, size: of :func:`plane_of`.
+    """
+    cloud = cloud_of_start(scene)
+    if cloud is None:
+        return origin, size
+    declared = scene.body.size_m
+    sides = None if declared is None else np.abs(axes[:2]) @ np.asarray(declared, dtype=float)
+    places, held = (cloud - origin) @ axes.T, (scene.controllers[0] - origin) @ axes[:2].T
+    spacing = spacing_of(cloud)
+    near = np.abs(places[:, 2]) < _FLAT * size.min()
+    found = [
+        reach_along(places[near, axis], None if sides is None else float(sides[axis]), held[:, axis], spacing)
+        for axis in range(2)
+    ]
+    if found[0] is None or found[1] is None:
+        return origin, size
+    (left, across), (low, along) = found
+    return origin + np.array([left, low]) @ axes[:2], np.array([across, along])
 
 
 def plane_of(scene: Scene, points: Array) -> tuple[Array, Array, Array, float]:

@@ -18,6 +18,9 @@ ROUNDS = 3
 LEAST_PIXELS = 6
 BAND_M = 0.015
 """From the patch's median; a patch of 1 cm that is seen at 60 degrees spans as much."""
+STRAY_PX, STEEP = 5, 2.7
+"""Half the side of a window, and the slope of a surface seen at 70 degrees. A pixel that is farther from the window's
+median than such a surface gets mixes the object with what is behind it."""
 FLAT_SIGMAS = 3.5
 """Robust deviations of a plane's own pixels: farther from it lies another surface."""
 
@@ -124,6 +127,30 @@ def on_plane(plane: tuple[float, float, float], camera: Camera, pixels: Array) -
     """Places (P, 3) [m] of pixels (P, 2) on a plane of ``plane_in``."""
     inverse = plane[0] + plane[1] * (pixels[:, 0] - camera.cx) + plane[2] * (pixels[:, 1] - camera.cy)
     return back_project(camera, pixels, 1.0 / inverse)
+
+
+def without_strays(depth: Array, camera: Camera, mask: Array) -> Array:
+    """The mask (H, W) without pixels that have no depth, or one far from that of the mask's pixels around them.
+
+    Args:
+        depth: (H, W) [m], 0: none.
+        camera: whose picture it is.
+        mask: (H, W) bool.
+    """
+    measured = mask & (depth > 0)
+    rows, columns = np.nonzero(measured)
+    side = np.arange(-STRAY_PX, STRAY_PX + 1, 2)
+    down, right = (part.ravel() for part in np.meshgrid(side, side, indexing="ij"))
+    height, width = depth.shape
+    near = (
+        np.clip(rows[:, None] + down, 0, height - 1),
+        np.clip(columns[:, None] + right, 0, width - 1),
+    )
+    around = _median(depth[near], measured[near])
+    bound = np.maximum(BAND_M, STEEP * STRAY_PX * around / camera.fx)
+    kept = measured.copy()
+    kept[measured] = np.abs(depth[measured] - around) <= bound
+    return kept
 
 
 def _median(values: Array, valid: Array) -> Array:

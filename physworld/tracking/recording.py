@@ -15,14 +15,17 @@ from scipy.spatial import cKDTree
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
 from physworld.tracking.agreement import Agreement, agreement
+from physworld.tracking.depth import without_strays
 from physworld.tracking.given import GivenFollower, GivenTracks
 from physworld.tracking.mask import Box, Outline, mask_in_box, mask_near_cloud
 from physworld.tracking.neighbours import carried
-from physworld.tracking.places import TrackConfig
+from physworld.tracking.places import FirstPlaces, TrackConfig
 from physworld.tracking.points import Follower, follow
-from physworld.tracking.view import View, cloud_of
+from physworld.tracking.view import View, back_project, cloud_of
 
 CLOUD_CELL_M = 2.5e-3
+MOST_OF_CLOUD, EDGE_PATCH_PX = 6000, 8
+"""Pixels of a cloud with edges, and half the side of the patch whose plane gives each its depth."""
 LEAST_SHARE_SEEN = 0.1
 """Of the frames; a point that is seen less is left out."""
 SAME_PLACE = 0.5
@@ -169,8 +172,8 @@ def follow_all(
     usual = float(np.median(known)) if known else 1.0
     chosen, shared = distinct(points, visible, owner, np.array([sigma or usual for sigma in noise]))
     outlines = [
-        cloud_of(view.camera, view.depth(0), mask)[0]
-        for view, mask in zip(views, masks.each, strict=True)
+        cloud_of(view.camera, depth, without_strays(depth, view.camera, mask))[0]
+        for view, mask, depth in zip(views, masks.each, [view.depth(0) for view in views], strict=True)
         if mask is not None
     ]
     return Followed(
@@ -186,6 +189,33 @@ def follow_all(
         noise,
         left_out,
     )
+
+
+def edged_cloud(views: list[View], masks: list[Array]) -> Array:
+    """Places (S, 3) [m] of pixels on the object in the first frame, those of its edges among them.
+
+    A depth camera loses edges, a colour camera does not: every pixel has the depth of the plane through what is
+    measured of the object around it.
+
+    Args:
+        views: the cameras.
+        masks: the object in each, (H, W) bool, or of no size.
+    """
+    found, rng = [], np.random.default_rng(0)
+    for view, mask in zip(views, masks, strict=True):
+        if not mask.size:
+            continue
+        rows, columns = np.nonzero(mask)
+        most = MOST_OF_CLOUD // len(views)
+        if len(rows) > most:
+            chosen = np.sort(rng.choice(len(rows), most, replace=False))
+            rows, columns = rows[chosen], columns[chosen]
+        depth = np.where(without_strays(view.depth(0), view.camera, mask), view.depth(0), 0.0)
+        pixels = np.stack([columns, rows], axis=1) + 0.5
+        distance = FirstPlaces(view.camera, mask, depth, pixels, EDGE_PATCH_PX).distance
+        fine = np.isfinite(distance)
+        found.append(back_project(view.camera, pixels[fine], distance[fine]))
+    return np.concatenate(found)
 
 
 def _step(followers: dict[int, Follower | GivenFollower], frame: int, config: TrackConfig) -> None:

@@ -7,7 +7,10 @@ V less what was summed before it. Both kernels walk from front to back.
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,6 +21,10 @@ from torch import Tensor
 from physworld.arrays import Array
 from physworld.devices import default_device
 from physworld.video.render_kernels import TILE, blend, blend_adjoint
+
+_WORTH_SHARING_PX = 1 << 16
+"""Pictures of fewer pixels are drawn in one piece."""
+_MOST_BANDS = 8
 
 
 @dataclass(frozen=True)
@@ -59,15 +66,33 @@ def blended(canvas: Canvas, inputs: list[Any]) -> list[Any]:
     outputs = [
         wp.zeros(pixels, dtype=kind, device=canvas.device) for kind in (wp.vec3f, wp.float32, wp.float32)
     ]
-    wp.launch(
-        blend,
-        dim=pixels,
-        inputs=[
-            canvas.width, -(-canvas.width // TILE), *inputs, wp.vec3f(*canvas.background), *outputs,
-        ],
-        device=canvas.device,
-    )  # fmt: skip
+    shared = [canvas.width, -(-canvas.width // TILE), *inputs, wp.vec3f(*canvas.background), *outputs]
+
+    def draw(band: tuple[int, int]) -> None:
+        first, end = band
+        wp.launch(blend, dim=end - first, inputs=[first, *shared], device=canvas.device)
+
+    bands = _bands(canvas)
+    if len(bands) == 1:
+        draw(bands[0])
+        return outputs
+    wp.load_module(blend.module.name, device=canvas.device)  # once, before threads ask for it
+    with ThreadPoolExecutor(len(bands)) as threads:
+        list(threads.map(draw, bands))
     return outputs
+
+
+def _bands(canvas: Canvas) -> list[tuple[int, int]]:
+    """Ranges of pixels that are drawn side by side: one, but on the processor one a core, each of whole rows of tiles.
+
+    A kernel on the processor runs in the thread that launches it, and leaves the interpreter to the others.
+    """
+    rows = -(-canvas.height // TILE)
+    count = 1
+    if not wp.get_device(canvas.device).is_cuda and canvas.width * canvas.height >= _WORTH_SHARING_PX:
+        count = min(len(os.sched_getaffinity(0)), _MOST_BANDS, rows)
+    ends = [TILE * canvas.width * (rows * k // count) for k in range(count)]
+    return list(pairwise([*ends, canvas.width * canvas.height]))
 
 
 class Blend(torch.autograd.Function):

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from physworld.arrays import Array
@@ -48,6 +49,10 @@ class GaussianCarrier:
             )
         self._around = neighbourhoods(self.rest, min(neighbours, len(self.rest) - 1))
         self.index, self.weight = index, inverse_distance_weights(distance)
+        self._pulls = csr_matrix(
+            (self.weight.ravel(), index.ravel(), np.arange(len(index) + 1) * index.shape[1]),
+            shape=(len(index), len(self.rest)),
+        )
 
     def at(self, moved: Array) -> tuple[Gaussians, Array]:
         """The splat when the vertices are at ``moved`` (n, 3), and what each Gaussian was turned by, (G, 4).
@@ -59,14 +64,16 @@ class GaussianCarrier:
         if moved.shape != self.rest.shape or not np.isfinite(moved).all():
             raise ValueError(f"vertices must be finite and of shape {self.rest.shape}, got {moved.shape}")
         rotation = local_rotations(self.rest, moved, index=self._around)
-        offset = self.gaussians.means[:, None] - self.rest[self.index]
-        carried = np.einsum("mkxy,mky->mkx", rotation[self.index], offset) + moved[self.index]
+        # sum_k w_k (R_k (p - x_k) + y_k), as one affine map a Gaussian
+        shift = moved - np.einsum("nxy,ny->nx", rotation, self.rest)
+        maps = (self._pulls @ np.concatenate([rotation.reshape(-1, 9), shift], axis=1)).reshape(-1, 12)
+        means = np.einsum("mxy,my->mx", maps[:, :9].reshape(-1, 3, 3), self.gaussians.means) + maps[:, 9:]
         turns = quaternion_of(rotation)[self.index]
         agree = np.where(np.einsum("mkq,mq->mk", turns, turns[:, 0]) < 0.0, -1.0, 1.0)
         turn = np.einsum("mk,mkq->mq", self.weight * agree, turns)
         turn /= np.linalg.norm(turn, axis=1, keepdims=True)
         return replace(
             self.gaussians,
-            means=np.einsum("mk,mkx->mx", self.weight, carried),
+            means=means,
             rotations=quaternion_product(turn, self.gaussians.rotations),
         ), turn

@@ -32,14 +32,14 @@ class Projected:
         centre: (G, 2) [px].
         conic: Σ'⁻¹ as (xx, xy, yy), (G, 3) [1/px²].
         depth: along the camera's axis, (G,) [m].
-        radius: that a splat covers, (G,) [px], detached.
+        reach: half the width and height of what a splat covers, (G, 2) [px], detached.
         good: which of them can be drawn, (G,) bool, detached.
     """
 
     centre: Tensor
     conic: Tensor
     depth: Tensor
-    radius: Array
+    reach: Array
     good: Array
 
 
@@ -71,27 +71,25 @@ def project(means: Tensor, log_scales: Tensor, rotations: Tensor, camera: Camera
     middle = torch.tensor([camera.cx, camera.cy]).double()
     safe = torch.where(determinant > 0, determinant, torch.ones_like(determinant))
     with torch.no_grad():
-        mean = 0.5 * (xx + yy)
-        largest = mean + torch.sqrt((mean * mean - determinant).clamp(min=0.0))
-        radius = REACH * torch.sqrt(largest)
-        good = front & (determinant > 0) & torch.isfinite(radius)
+        reach = REACH * torch.sqrt(torch.stack([xx, yy], dim=1))
+        good = front & (determinant > 0) & torch.isfinite(reach).all(dim=1)
     return Projected(
         tangents * focal + middle,
         torch.stack([yy, -xy, xx], dim=1) / safe[:, None],
         local[:, 2],
-        radius.numpy(),
+        reach.numpy(),
         good.numpy(),
     )
 
 
 def tiles(
-    centre: Array, radius: Array, depth: Array, good: Array, width: int, height: int
+    centre: Array, reach: Array, depth: Array, good: Array, width: int, height: int
 ) -> tuple[Array, Array]:
-    """Gaussians of every tile of 16 x 16 px, nearest first: ``order``, and where each tile's begin (tiles + 1,).
+    """Gaussians of every tile, nearest first: ``order``, and where those of each tile begin, (tiles + 1,).
 
     Args:
         centre: (G, 2) [px].
-        radius: (G,) [px].
+        reach: half the width and height that each covers, (G, 2) [px].
         depth: (G,) [m].
         good: which are drawn, (G,) bool.
         width, height: of the picture [px].
@@ -101,9 +99,10 @@ def tiles(
     """
     across, down = -(-width // TILE), -(-height // TILE)
     number = np.flatnonzero(good)
+    number = number[np.argsort(depth[number], kind="stable")]
     with np.errstate(invalid="ignore", over="ignore"):
-        low = np.floor((centre[number] - radius[number, None]) / TILE)
-        high = np.floor((centre[number] + radius[number, None]) / TILE) + 1
+        low = np.floor((centre[number] - reach[number]) / TILE)
+        high = np.floor((centre[number] + reach[number]) / TILE) + 1
     low = np.clip(low, 0, [across, down]).astype(np.int64)
     high = np.clip(high, 0, [across, down]).astype(np.int64)
     size = np.maximum(high - low, 0)
@@ -111,15 +110,16 @@ def tiles(
     if count.sum() > MOST_PAIRS:
         raise ValueError(
             f"{count.sum()} pairs of splat and tile, more than {MOST_PAIRS}: splats of up to "
-            f"{radius[number].max():.3g} px"
+            f"{reach[number].max():.3g} px"
         )
     which = np.repeat(np.arange(len(number)), count)
     place = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
-    column = low[which, 0] + place % np.maximum(size[which, 0], 1)
-    row = low[which, 1] + place // np.maximum(size[which, 0], 1)
-    tile = row * across + column
-    sorted_pairs = np.lexsort((depth[number[which]], tile))
-    starts = np.searchsorted(tile[sorted_pairs], np.arange(across * down + 1))
+    down_by, right_by = np.divmod(place, np.maximum(size[which, 0], 1))
+    tile = (low[which, 1] + down_by) * across + low[which, 0] + right_by
+    # numpy sorts small integers by their digits, and pairs are in the order of depth already
+    small = tile.astype(np.uint16) if across * down <= 1 << 16 else tile
+    sorted_pairs = np.argsort(small, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(tile, minlength=across * down))])
     return starts, number[which[sorted_pairs]]
 
 

@@ -73,7 +73,7 @@ class Renderer:
                 camera,
             )
         centre, conic, depth = (tensor.numpy() for tensor in (seen.centre, seen.conic, seen.depth))
-        starts, order = tiles(centre, seen.radius, depth, seen.good, camera.width, camera.height)
+        starts, order = tiles(centre, seen.reach, depth, seen.good, camera.width, camera.height)
         canvas = Canvas(camera.width, camera.height, starts, order, self.background, self.device)
         inputs = canvas.arrays(centre, conic, gaussians.opacities, self._colours(gaussians, turn), depth)
         shape = (camera.height, camera.width)

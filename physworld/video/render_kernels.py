@@ -1,17 +1,21 @@
-"""Warp kernel of the renderer: one thread a pixel, front to back over the Gaussians of its tile."""
+"""Warp kernels of the renderer: one thread a pixel, from ``first`` on, front to back over the Gaussians of its tile."""
 
 from __future__ import annotations
 
+import math
+
 import warp as wp
 
-TILE = 16
+TILE = 8
 _LEAST_ALPHA = 1.0 / 255.0
+_LEAST_POWER = math.log(_LEAST_ALPHA) - 1e-3  # below it no opacity shows, and the exponential is spared
 _MOST_ALPHA = 0.99
 _LEAST_LEFT = 1e-4
 
 
 @wp.kernel
 def blend(
+    first: int,
     width: int,
     tiles_across: int,
     starts: wp.array[wp.int32],
@@ -26,7 +30,7 @@ def blend(
     alpha: wp.array[wp.float32],
     depth: wp.array[wp.float32],
 ) -> None:
-    pixel = wp.tid()
+    pixel = first + wp.tid()
     row = pixel // width
     column = pixel - row * width
     tile = (row // wp.static(TILE)) * tiles_across + column // wp.static(TILE)
@@ -42,7 +46,7 @@ def blend(
         dx = x - centre[0]
         dy = y - centre[1]
         power = -0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) - conic[1] * dx * dy
-        if power <= 0.0:
+        if power <= 0.0 and power >= wp.static(_LEAST_POWER):
             a = wp.min(wp.static(_MOST_ALPHA), opacities[g] * wp.exp(power))
             if a >= wp.static(_LEAST_ALPHA):
                 after = left * (1.0 - a)
@@ -101,7 +105,7 @@ def blend_adjoint(
         dx = x - centre[0]
         dy = y - centre[1]
         power = -0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) - conic[1] * dx * dy
-        if power <= 0.0:
+        if power <= 0.0 and power >= wp.static(_LEAST_POWER):
             fall = wp.exp(power)
             a = wp.min(wp.static(_MOST_ALPHA), opacities[g] * fall)
             if a >= wp.static(_LEAST_ALPHA):

@@ -207,7 +207,7 @@ def loss_of(
     seen = project(free["means"], free["log_scales"], quaternions, target.view.camera)
     centre = seen.centre - torch.tensor([target.left, target.top]).double()
     starts, order = tiles(
-        centre.detach().numpy(), seen.radius, seen.depth.detach().numpy(), seen.good, width, height
+        centre.detach().numpy(), seen.reach, seen.depth.detach().numpy(), seen.good, width, height
     )
     canvas = Canvas(width, height, starts, order, background, config.device)
     rgb, alpha, far = Blend.apply(  # type: ignore[no-untyped-call]

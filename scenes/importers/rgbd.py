@@ -22,9 +22,10 @@ from physworld.scene import Scene, sigma_of
 from physworld.tracking.agreement import WARNED_APART_M
 from physworld.tracking.ground import Plane, ground_plane, world_over
 from physworld.tracking.mask import Box
+from physworld.tracking.middle import onto_middle
 from physworld.tracking.noise import sighting_covariances
 from physworld.tracking.places import TrackConfig
-from physworld.tracking.recording import Followed, Masks, follow_all, masks_of
+from physworld.tracking.recording import Followed, Masks, edged_cloud, follow_all, masks_of
 from physworld.tracking.rigid import RigidPath
 from physworld.tracking.view import View, cloud_of
 from physworld_scenes.bundle import checked, scene_from_parts
@@ -36,6 +37,7 @@ from physworld_scenes.importers.options import ImportOptions, estimate_noise, sp
 from physworld_scenes.importers.pictures import Pictures, read_pictures
 
 DEFAULT_KIND, DEFAULT_FPS = "blob", 30.0
+ROD_KINDS, SHEET_KINDS = ("rope", "rod", "branched_rope"), ("sheet", "cloth")
 GROUND_NEAR_M = 0.05
 """From the object's lowest point: a ground that is farther away is none of the scene."""
 LEVEL_DEG = 15.0
@@ -106,6 +108,7 @@ def read_folder(
         masks = masks_of(views, boxes, made, None if ground is None else ground.height)
         config = TrackConfig(points=given.points)
         followed = follow_all(views, masks, config, told, tracks, estimate_noise)
+        followed = _as_its_kind(followed, options, config)
         warnings += _disagreements(masks, followed)
         fps = options.fps or recording.fps
         if fps is None:
@@ -123,6 +126,19 @@ def read_folder(
         declared["notes"]["cameras"] = _cameras(masks, followed)
     scene, found = checked(scene_from_parts(declared, arrays))
     return scene, warnings + found, followed
+
+
+def _as_its_kind(followed: Followed, options: ImportOptions, config: TrackConfig) -> Followed:
+    """What is thin: the cloud of a rope or sheet reaches to its edges, points of a rope lie on its middle line."""
+    kind, radius = options.kind or DEFAULT_KIND, options.body.get("radius_m")
+    if kind in ROD_KINDS + SHEET_KINDS:
+        followed = replace(followed, cloud=edged_cloud(followed.views, followed.masks))
+    if kind not in ROD_KINDS or not isinstance(radius, int | float):
+        return followed
+    points = onto_middle(
+        followed.points, followed.visible, followed.cameras, followed.views, float(radius), config.depth_px
+    )
+    return replace(followed, points=points)
 
 
 def _disagreements(masks: Masks, followed: Followed) -> list[str]:

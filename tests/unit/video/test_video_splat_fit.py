@@ -39,7 +39,7 @@ def drawn(free: dict[str, torch.Tensor], camera: Camera) -> tuple[torch.Tensor, 
     seen = project(free["means"], free["log_scales"], turns, camera)
     starts, order = tiles(
         seen.centre.detach().numpy(),
-        seen.radius,
+        seen.reach,
         seen.depth.detach().numpy(),
         seen.good,
         camera.width,
