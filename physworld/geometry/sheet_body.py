@@ -146,14 +146,13 @@ def _as_shown(scene: Scene, origin: Array, axes: Array, size: Array) -> tuple[Ar
     places, held = (cloud - origin) @ axes.T, (scene.controllers[0] - origin) @ axes[:2].T
     spacing = spacing_of(cloud)
     near = np.abs(places[:, 2]) < _FLAT * size.min()
-    found = [
+    across, along = (
         reach_along(places[near, axis], None if sides is None else float(sides[axis]), held[:, axis], spacing)
         for axis in range(2)
-    ]
-    if found[0] is None or found[1] is None:
+    )
+    if across is None or along is None:
         return origin, size
-    (left, across), (low, along) = found
-    return origin + np.array([left, low]) @ axes[:2], np.array([across, along])
+    return origin + np.array([across[0], along[0]]) @ axes[:2], np.array([across[1], along[1]])
 
 
 def plane_of(scene: Scene, points: Array) -> tuple[Array, Array, Array, float]:
