@@ -80,6 +80,7 @@ class Effect:
         kind: where it enters.
         gates: fields whose zero switches the effect off.
         strains: acts on the strains of a body's cells, which a mesh of triangles does not have.
+        odds: that it acts, before any recording, over those of other effects; below one where hardly any body has it.
         contains: effects that this one is, with some of its strengths at zero; its others have to earn their place
             beside them.
         instead: a measurement that settles whether the effect is there without a motion of the grips, for people.
@@ -91,6 +92,7 @@ class Effect:
     kind: ClassVar[Kind]
     gates: ClassVar[tuple[str, ...]]
     strains: ClassVar[bool] = False
+    odds: ClassVar[float] = 1.0
     contains: ClassVar[tuple[str, ...]] = ()
     instead: ClassVar[str | None] = None
 

@@ -3,7 +3,7 @@
 Coulomb's law against something that stands still, as large at every speed: a table, a film or a brush that the scene
 does not declare and that bears the same load everywhere; d = mu g for a body that lies flat. Below v0 = 20 mm/s it is
 viscous, so that a body comes to rest without chattering. A body decelerates at an even rate where linear drag lets it
-die away.
+die away. A body in the air rubs against nothing: beside drag and viscosity it needs fifty times their support.
 """
 
 from __future__ import annotations
@@ -84,6 +84,7 @@ class DryFriction(Effect):
     equation = "a = -d v / sqrt(|v|^2 + v0^2)"
     kind = "force"
     gates = ("size_m_s2",)
+    odds = 0.02
 
     size_m_s2: float = 0.0
 

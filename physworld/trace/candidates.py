@@ -50,6 +50,11 @@ class Candidate:
         """Effects that it is with some strengths at zero."""
         return EFFECTS[self.effect].contains
 
+    @property
+    def odds(self) -> float:
+        """That the effect acts, over those of other effects."""
+        return EFFECTS[self.effect].odds
+
     def unknowns(self) -> list[Unknown]:
         """The gates, in units of their probes; with what is known of them beforehand."""
         return [of_strength(self.effect, gate, spread=gate.prior_deviation) for gate in self.gates]

@@ -6,8 +6,8 @@ The softmax of that and the log prior is averaged over the draws, as pseudo-BMA+
 Gelman 2018). So a hypothesis that wins in a few blocks only does not win by much, and the odds mean what they say
 although no twin is the truth.
 
-Prior: an effect acts with odds of one to one, whichever of the library it is; so k effects of n have (2 n)^-k. Beside
-it stands the prior density of the strengths, over that at their mean.
+Prior: an effect acts with odds of one to one, whichever of the library it is, but for those whose file says otherwise;
+so k effects of n have (2 n)^-k. Beside it stands the prior density of the strengths, over that at their mean.
 """
 
 from __future__ import annotations

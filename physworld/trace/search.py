@@ -133,8 +133,8 @@ class Search:
     def _log_prior(self, hypothesis: Hypothesis) -> float:
         if not hypothesis.members:
             return hypothesis.log_prior
-        effects = sum(1 + len(member.contains) for member in hypothesis.members)
-        return hypothesis.log_prior - effects * float(np.log(2.0 * self.library))
+        odds = [m.odds / (2.0 * self.library) ** (1 + len(m.contains)) for m in hypothesis.members]
+        return hypothesis.log_prior + float(np.log(odds).sum())
 
     def _total(self, hypothesis: Hypothesis) -> float:
         """Log posterior up to a constant, all blocks alike."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from physworld.effects.registry import effect
 from physworld.estimation.unknowns import Unknown
 from physworld.trace.answer import decided
 from physworld.trace.candidates import Candidate
@@ -126,6 +127,22 @@ def test_without_a_candidate_that_makes_sense_the_declared_physics_has_everythin
     search.hypotheses[()] = declared
     assert search.library == 0
     np.testing.assert_array_equal(search.weights(), [1.0])
+
+
+def test_what_hardly_any_body_has_needs_more_support() -> None:
+    """Dry friction and linear drag that predict alike: the odds in the effect's file decide."""
+    search = Search(None, [Candidate("dry_friction", "", ())], None, 1, 1, 1)  # type: ignore[arg-type]
+    unseen = LeftOut(np.full(BLOCKS, 1.1), np.full(BLOCKS, ROWS))
+    for name in ("dry_friction", "air_drag_linear"):
+        alike: Any = SimpleNamespace(
+            members=(Candidate(name, "", ()),), left=1.1, log_prior=0.0, unseen=unseen
+        )
+        search.hypotheses[(name,)] = alike
+    search.hypotheses[()] = SimpleNamespace(  # type: ignore[assignment]
+        members=(), left=50.0, log_prior=0.0, unseen=LeftOut(np.full(BLOCKS, 50.0), np.full(BLOCKS, ROWS))
+    )
+    rubs, drags, _ = search.weights()
+    assert rubs / drags == pytest.approx(effect("dry_friction").odds)
 
 
 @pytest.mark.parametrize(
