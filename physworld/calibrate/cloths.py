@@ -46,8 +46,8 @@ from physworld.effects.measurement_scale import MeasurementScale
 from physworld.effects.measurement_turn import MeasurementTurn
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.estimation.journal import Journal
-from physworld.estimation.least_squares import correlations
-from physworld.estimation.unknowns import LINEAR, LOG, at
+from physworld.estimation.least_squares import correlations, damped_step
+from physworld.estimation.unknowns import LINEAR, LOG, at, bounds_of
 from physworld.scene import Scene
 from physworld.twin.twin import Twin
 
@@ -112,9 +112,6 @@ class _Search:
     def __post_init__(self) -> None:
         self.mean = np.array([u.start for u in self.unknowns])
         self.spread = np.array([1.0 if u.prior is None else u.prior[1] for u in self.unknowns])
-        self.low, self.high = (
-            np.array(ends) for ends in zip(*(u.bounds for u in self.unknowns), strict=True)
-        )
         self.runs = sum(u.name.split(".")[0] not in _CAMERA for u in self.unknowns)
         end = self.scene.train[1]
         self.seen, self.target = self.scene.visible[1:end], self.scene.points[1:end]
@@ -211,9 +208,8 @@ class _Search:
             matrix, gradient = self.normal(theta, rows)
             before = cost
             for _ in range(_TRIALS):
-                step = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
-                trial = theta + np.clip(step, -_LONGEST * self.spread, _LONGEST * self.spread)
-                trial = np.clip(trial, self.low, self.high)
+                trial = theta + damped_step(matrix, gradient, damping, _LONGEST * self.spread)
+                trial = np.clip(trial, *bounds_of(self.unknowns))
                 found = self.residuals(trial)
                 if found is not None and self.cost(found, trial) < cost:
                     theta, rows, cost = trial, found, self.cost(found, trial)
@@ -238,13 +234,13 @@ class _Shared(_Search):
     def __init__(self, parts: list[_Search], unknowns: list[Parameter]) -> None:
         lead = parts[0]
         super().__init__(lead.scene, lead.twin, unknowns, lead.limit, lead.progress, lead.cancelled)
-        self.parts, self.runs = parts, sum(part.runs for part in parts)
+        self.parts, self.runs = parts, max(part.runs for part in parts)
         self.places = [of_recording(unknowns, k) for k in range(len(parts))]
 
     def residuals(self, theta: Array) -> Any:
         """Rows of every recording; None where one of them has no run."""
         found = [part.residuals(theta[own]) for part, own in zip(self.parts, self.places, strict=True)]
-        self.simulations = sum(part.simulations for part in self.parts)
+        self.simulations = max(part.simulations for part in self.parts)
         return None if any(rows is None for rows in found) else found
 
     def misfit(self, rows: Any) -> float:
@@ -258,7 +254,7 @@ class _Shared(_Search):
             known, pull = part.information(theta[own], there)
             matrix[np.ix_(own, own)] += known
             gradient[own] += pull
-        self.simulations = sum(part.simulations for part in self.parts)
+        self.simulations = max(part.simulations for part in self.parts)
         return matrix, gradient
 
     def agreement(self, theta: Array) -> tuple[Agreement, ...]:

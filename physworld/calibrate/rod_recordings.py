@@ -19,7 +19,7 @@ from physworld.twin.twin import Twin
 
 
 class SharedRodSearch(RodSearch):
-    """Launches of a calibration over several recordings, one of each a place; see :class:`RodSearch`.
+    """Launches of a calibration over several recordings; one of every recording counts as one: see :class:`RodSearch`.
 
     Residuals stand one recording after the other, each in the deviations that its model leaves and that frames which
     err alike leave: ``sigma`` and ``together`` are 1.
@@ -48,13 +48,13 @@ class SharedRodSearch(RodSearch):
         for k, (part, last) in enumerate(zip(self.parts, self._ends[end], strict=True)):
             places = of_recording(unknowns, k)
             part.settle([unknowns[p] for p in places], theta[places], last)
-        self.simulations += len(self.parts)
+        self.simulations += 1
 
     def launched(
         self, unknowns: Sequence[Parameter], places: Sequence[Array], end: int
     ) -> list[Array | None]:
         """Weighted residuals of all recordings at places (p,); None where one of them cannot be trusted."""
-        self.simulations += len(self.parts)
+        self.simulations += 1
         found = []
         for k, (part, last) in enumerate(zip(self.parts, self._ends[end], strict=True)):
             weight = 1.0 / (part.sigma * np.sqrt(part.together))
@@ -66,10 +66,6 @@ class SharedRodSearch(RodSearch):
             else None
             for several in zip(*found, strict=True)
         ]
-
-    def reaches(self, launches: int) -> bool:
-        """Whether so many launches of every recording are left."""
-        return super().reaches(launches * len(self.parts))
 
     def rms(self, residual: Array, end: int) -> float:
         """Root mean square [m] of weighted residuals."""

@@ -16,7 +16,8 @@ from physworld.calibrate.parameters import Parameter
 from physworld.calibrate.rod_parameters import GRAVITY
 from physworld.engine.rods.discrete_rods import DiscreteRods
 from physworld.errors import Cancelled, SimulationError
-from physworld.estimation.unknowns import at
+from physworld.estimation.least_squares import damped_step
+from physworld.estimation.unknowns import at, bounds_of
 from physworld.scene import Scene
 from physworld.twin.rods import driven_at, shapes
 from physworld.twin.twin import Twin
@@ -182,10 +183,10 @@ class RodSearch:
             weight = 1.0 / (self.sigma**2 * self.together)
             normal = weight * jacobian.T @ jacobian + np.diag(prior**2)
             gradient = weight * jacobian.T @ residual + prior * off
-            trials = []
-            for damping in _DAMPINGS:
-                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-                trials.append(_within(unknowns, theta + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)))
+            trials = [
+                np.clip(theta + damped_step(normal, gradient, damping, _LONGEST_STEP), *bounds_of(unknowns))
+                for damping in _DAMPINGS
+            ]
             costs = [
                 np.inf if found is None else self.cost(found, off_priors(unknowns, trial)[0])
                 for trial, found in zip(trials, self.launched(unknowns, trials, end), strict=True)
@@ -257,8 +258,3 @@ def off_priors(unknowns: Sequence[Parameter], theta: Array) -> tuple[Array, Arra
     means = np.array([p[0] for p in known if p is not None])
     inverse = np.array([1.0 / p[1] for p in known if p is not None])
     return (theta - means) * inverse, inverse
-
-
-def _within(unknowns: Sequence[Parameter], theta: Array) -> Array:
-    low, high = (np.array(ends) for ends in zip(*(u.bounds for u in unknowns), strict=True))
-    return np.clip(theta, low, high)

@@ -8,15 +8,13 @@ With few clusters a sandwich may come out too small by chance; the variances are
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student
 
 from physworld.arrays import Array
-
-Residual = Callable[[Array], Array]
 
 _TOLERANCE = 2e-4  # relative fall of the cost that ends the search
 _MAX_STEP = 1.5  # in the logarithm
@@ -48,39 +46,14 @@ Asked = tuple[list[Array], list[Array]]
 Descent = Generator[Asked, list[np.ndarray], Solution]
 
 
-def gauss_newton(
-    residual: Residual,
-    theta: Array,
-    low: Array,
-    high: Array,
-    steps: Array,
-    max_iterations: int = 6,
-) -> Solution:
-    """Minimise the mean square of ``residual`` from ``theta`` within [low, high].
+def descent(theta: Array, low: Array, high: Array, steps: Array, max_iterations: int = 6) -> Descent:
+    """Minimise the mean square of a residual from ``theta`` within [low, high], for whoever runs the simulations.
+
+    Yields places that do not depend on each other and those that it will likely ask for next, is sent the residuals of
+    the former, in their order, and returns the solution.
 
     A residual that is not finite is a failed simulation: the step is shortened. One run per parameter and Jacobian,
     one per trial step; ``max_iterations`` Jacobians at most.
-
-    Args:
-        residual: of a place theta (p,), (m,).
-        theta: start, (p,).
-        low, high: bounds, (p,) each.
-        steps: of the finite differences, (p,).
-        max_iterations: Jacobians at most.
-    """
-    asking = descent(theta, low, high, steps, max_iterations)
-    needed, _ = next(asking)
-    while True:
-        try:
-            needed, _ = asking.send([residual(one) for one in needed])
-        except StopIteration as ended:
-            found: Solution = ended.value
-            return found
-
-
-def descent(theta: Array, low: Array, high: Array, steps: Array, max_iterations: int = 6) -> Descent:
-    """:func:`gauss_newton` for whoever runs its simulations: yields places that do not depend on each other and those
-    that it will likely ask for next, is sent the residuals of the former, in their order, and returns the solution.
 
     Args:
         theta: start, (p,).
@@ -130,6 +103,20 @@ def _trial(
     step = np.clip(np.linalg.solve(damped(normal, damping), -gradient), -_MAX_STEP, _MAX_STEP)
     there: Array = np.clip(theta + step, low, high)
     return there
+
+
+def damped_step(normal: Array, gradient: Array, damping: float, longest: float | Array) -> Array:
+    """A step (p,) of a search whose priors make its normal matrix (p, p) invertible, damped as Marquardt does.
+
+    Args:
+        normal: half the second derivatives of the cost, (p, p).
+        gradient: half the first ones, (p,).
+        damping: share by which the diagonal is larger.
+        longest: of the step, for all or each of the unknowns.
+    """
+    step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+    shortened: Array = np.clip(step, -longest, longest)
+    return shortened
 
 
 def damped(normal: Array, damping: float) -> Array:

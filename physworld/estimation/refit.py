@@ -52,13 +52,6 @@ class Refit:
         """Root mean squared whitened residual: 1 for a perfect model."""
         return float(np.sqrt(np.mean(self.residual**2)))
 
-    @property
-    def free_jacobian(self) -> Array:
-        """The sensitivities of the unknowns that no bound holds, (M, r)."""
-        low, high = bounds_of(self.unknowns)
-        room = 1e-3 * (high - low)
-        return self.jacobian[:, (self.theta > low + room) & (self.theta < high - room)]
-
     def value(self, name: str) -> float:
         """The number of that name."""
         names = [unknown.name for unknown in self.unknowns]

@@ -34,8 +34,6 @@ _BUILT_IN: tuple[type[Law], ...] = (
 ELASTIC_LAWS: dict[str, type[Law]] = with_plugins("physworld.laws", Law, {law.name: law for law in _BUILT_IN})
 _OLD_NEO_HOOKEAN = "SolidLaw"  # in archives of version 0.1
 SOLID_LAWS = {name: law for name, law in ELASTIC_LAWS.items() if issubclass(law, SolidLaw)}
-SHEET_LAWS = {name: law for name, law in ELASTIC_LAWS.items() if issubclass(law, SheetLaw)}
-ROD_LAWS = {name: law for name, law in ELASTIC_LAWS.items() if issubclass(law, RodLaw)}
 
 
 def law_class(name: str, dimension: int) -> type[Law]:

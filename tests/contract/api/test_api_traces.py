@@ -81,6 +81,39 @@ def test_a_trace_of_several_recordings_says_which_are_fitted_and_which_held_out(
     assert_problem(client.post("/v1/traces", json={**body, "scene_ids": ["scn_none"]}), 404, "not_found")
 
 
+def test_a_fit_of_several_recordings_says_which(client: httpx.Client, service: Service) -> None:
+    first, second = (scene_id(client, f"cord {k}") for k in "ab")
+    body = {"scene_id": first, "scene_ids": [second]}
+    job, fit_id = made(client, "/v1/fits", body, "fit")
+    assert [item["id"] for item in job["inputs"]] == [first, second]
+    for _ in range(2):
+        fit = client.get(f"/v1/fits/{fit_id}").json()
+        assert {key: fit[key] for key in body} == body and "scene_ids" not in fit["metrics"]
+        service.work()
+    assert fit["state"] == "ready"
+    assert_problem(client.post("/v1/fits", json={**body, "scene_ids": [first]}), 422, "invalid_request")
+    field = client.post("/v1/fits", json={**body, "config": {"stages": "global+local"}})
+    assert_problem(field, 422, "invalid_request")
+    assert "fits a field to one recording" in field.text
+    assert_problem(client.post("/v1/fits", json={**body, "scene_ids": ["scn_none"]}), 404, "not_found")
+
+
+def test_a_pipeline_fits_and_traces_several_recordings(client: httpx.Client, service: Service) -> None:
+    second = scene_id(client, "cord c")
+    job = pipeline(client, "cord d", scene_ids=[second], close_the_loop=True, compare=False)
+    assert [item["id"] for item in job["inputs"]][1:] == [second]
+    service.work()
+    children = [
+        client.get(f"/v1/jobs/{child}").json()
+        for child in client.get(f"/v1/jobs/{job['id']}").json()["children"]
+    ]
+    asked = {
+        child["kind"]: [item["id"] for item in child["inputs"] if item["kind"] == "scene"]
+        for child in children
+    }
+    assert asked["fit"] == asked["trace"] == [job["inputs"][0]["id"], second]
+
+
 def test_traces_are_refused_cancelled_and_done_once(client: httpx.Client, service: Service) -> None:
     scene = scene_id(client)
     assert_problem(client.post("/v1/traces", json={"scene_id": "scn_none"}), 404, "not_found")

@@ -84,6 +84,15 @@ def test_a_fit_a_dataset_and_a_model_are_started_with_settings(
     assert physworld(service, tmp_path, "models", "show", "ver").returncode == 0
 
 
+def test_another_recording_of_the_object_is_named_as_the_first_is(
+    service: Service, client: Client, scene_id: str, tmp_path: Path
+) -> None:
+    job = output_of(service, tmp_path, "fits", "add", scene_id, "--with", "rope one")
+    client.jobs.cancel(job["id"])
+    first, second = (item["id"] for item in job["inputs"])
+    assert first == scene_id and client.scenes.get(second).name == "rope one"
+
+
 def test_a_setting_that_there_is_not_names_the_one_that_was_meant(
     service: Service, scene_id: str, tmp_path: Path
 ) -> None:

@@ -89,6 +89,30 @@ def test_the_figures_and_the_files_of_a_fit(
     assert "youngs_modulus_pa" in capsys.readouterr().out
 
 
+def test_several_recordings_are_fitted_together_and_reported_each(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = read_bundle(bundle)
+    twin = build_twin(scene, BUDGET).with_parameters(youngs_modulus_pa=1.3 * YOUNGS_MODULUS_PA)
+    other = tmp_path / "stiffer"
+    write_bundle(replace(recorded_by(twin, scene, 2e-4, seed=5), name="stiffer"), other)
+    figures, out = tmp_path / "fit.json", tmp_path / "twin"
+    more = arguments(other, "--simulations", "300", "--json", str(figures), "--out", str(out), "--quick")
+    assert fit.main([str(bundle), *more]) == 0
+    found = json.loads(figures.read_text())
+    assert [known["scene"] for known in found["recordings"]] == ["bar", "stiffer"]
+    modulus = found["parameters"]["youngs_modulus_pa"]["value"]
+    assert YOUNGS_MODULUS_PA < modulus < 1.3 * YOUNGS_MODULUS_PA
+    agreement = next(known for known in found["agreement"] if known["parameter"] == "youngs_modulus_pa")
+    soft, stiff = agreement["recordings"]
+    assert not agreement["agrees"] and soft["value"] < modulus < stiff["value"]
+    assert soft["shift_in_deviations"] < 0.0 < stiff["shift_in_deviations"]
+    for name in ("twin.npz", "twin_2.npz"):
+        with np.load(out / name, allow_pickle=False) as arrays:
+            assert Twin.from_arrays(dict(arrays)).parameters["youngs_modulus_pa"] == modulus
+    assert "RECORDINGS DISAGREE ON youngs_modulus_pa" in capsys.readouterr().out
+
+
 def test_a_search_that_its_budget_cut_short_is_said_in_words_and_in_figures(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

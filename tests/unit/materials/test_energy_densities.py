@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physworld.materials.library import SHEET_LAWS, SOLID_LAWS, law_class, with_law
+from physworld.materials.library import ELASTIC_LAWS, SOLID_LAWS, law_class, with_law
 from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.rod import RodLaw, rod_strains
 from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw, sheet_strains
@@ -100,6 +100,6 @@ def test_a_law_changes_its_name_and_keeps_its_numbers() -> None:
     law = NeoHookean(2e5, 0.2, viscosity_pa_s=3.0, density_kg_m3=400.0)
     other = with_law(law, "hencky")
     assert type(other).name == "hencky" and with_law(other, "neo_hookean") == law
-    assert type(with_law(SheetLaw(80.0, 2e-3), "orthotropic_sheet")) is SHEET_LAWS["orthotropic_sheet"]
+    assert type(with_law(SheetLaw(80.0, 2e-3), "orthotropic_sheet")) is ELASTIC_LAWS["orthotropic_sheet"]
     with pytest.raises(ValueError, match="no law 'hencky' for a body of dimension 2"):
         law_class("hencky", 2)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sqlalchemy import select
-from tiny_scene import FRAMES, tiny_scene
+from tiny_scene import FRAMES, register, tiny_scene
 
 from physworld.twin.twin import Twin
 from physworld_schemas.dataset import Dataset, DatasetConfig
@@ -107,6 +107,28 @@ def test_a_fit_that_ended_by_itself_has_converged_and_has_intervals(
     assert fit.search is not None and fit.search.converged and fit.search.open == {}
     assert fit.converged is not None and fit.not_measured == ""
     assert {name for name, known in fit.parameters.items() if known.ci95} == set(fit.converged)
+
+
+def test_a_fit_of_several_recordings_leaves_a_twin_of_each(
+    runtime_with, stores: Stores, scene_id: str
+) -> None:
+    second = register(replace(tiny_scene(), name="again"), stores.database, stores.artifacts)
+    config = FitConfig(particle_budget=60, max_simulations=120, damping="none")
+    with stores.database.session() as session:
+        job = jobs.create_fit(session, scene_id, config, scene_ids=[second])
+    assert _drain(runtime_with()) == ["done"]
+    with stores.database.reading() as session:
+        fit = resources.get_fit(session, job.outputs[0].id)
+    assert fit.scene_ids == [second] and [item.id for item in fit.lineage.inputs] == [scene_id, second]
+    assert [known["scene"] for known in fit.metrics["recordings"]] == ["tiny bar", "again"]
+    assert fit.metrics["recordings"][0]["held_out"]["track_m"] == fit.metrics["held_out"]["track_m"]
+    (agreement,) = fit.metrics["agreement"]
+    assert agreement["agrees"] and [one["scene"] for one in agreement["recordings"]] == ["tiny bar", "again"]
+    files = {"twin.npz", "prediction.npz", "report.json", "twin_2.npz", "prediction_2.npz"}
+    assert {artifact.name for artifact in fit.artifacts} == files
+    twins = [npz_arrays(stores.artifacts.read_bytes(named(fit.artifacts, name, fit.id).sha256))
+             for name in ("twin.npz", "twin_2.npz")]  # fmt: skip
+    assert Twin.from_arrays(twins[0]).law == Twin.from_arrays(twins[1]).law
 
 
 def test_a_fit_may_leave_its_numerics_out(runtime_with, stores: Stores, scene_id: str) -> None:

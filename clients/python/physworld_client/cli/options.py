@@ -22,7 +22,6 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a tabl
 Limit = Annotated[int, typer.Option("--limit", "-n", min=1, help="At most so many, newest first.")]
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the files [./ID].")]
 SceneName = Annotated[str, typer.Argument(help=help_of("scenes")), Named("scenes")]
-FitName = Annotated[str, typer.Argument(help=help_of("fits")), Named("fits")]
 TraceName = Annotated[str, typer.Argument(help=help_of("traces")), Named("traces")]
 DatasetName = Annotated[str, typer.Argument(help=help_of("datasets")), Named("datasets")]
 ModelName = Annotated[str, typer.Argument(help=help_of("models")), Named("models")]
