@@ -52,8 +52,9 @@ def onto_middle(
     close = nearest(points[0], min(NEIGHBOURS, points.shape[1] - 1))
     along = np.stack([_along(now[close], seen[close]) for now, seen in zip(points, visible, strict=True)])
     sine = np.linalg.norm(np.cross(rays, along), axis=2, keepdims=True)
-    moved: Array = points + rays * (before[owner, None] / np.maximum(sine, LEAST_SINE))
-    return np.where(narrow[:, None], moved, points)
+    shift = rays * (before[owner, None] / np.maximum(sine, LEAST_SINE))
+    moved: Array = np.where(narrow[:, None], points + shift, points)
+    return moved
 
 
 def seen_before(view: View, mask: Array, radius_m: float) -> float:
