@@ -135,12 +135,13 @@ def beside_line(line: Array, places: Array, eyes: Array) -> Array:
     own = np.argmin(np.linalg.norm(on_each - places[:, None], axis=2), axis=1)
     rows = np.arange(len(places))
     part = share[rows, own][None, :, None]
-    middle = (1.0 - part) * line[:, own] + part * line[:, own + 1]
+    middle: Array = (1.0 - part) * line[:, own] + part * line[:, own + 1]
     along = line[:, own + 1] - line[:, own]
     beside = np.cross(along[0], places - eyes)
     beside /= np.linalg.norm(beside, axis=1, keepdims=True)
     offset = beside * ((places - middle[0]) * beside).sum(axis=1, keepdims=True)
-    return middle + np.einsum("tnij,nj->tni", least_rotation(along[:1], along), offset)
+    tracks: Array = middle + np.einsum("tnij,nj->tni", least_rotation(along[:1], along), offset)
+    return tracks
 
 
 def followed_exactly(vertices: Array, triangles: Array, places: Array) -> Array:

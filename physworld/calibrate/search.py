@@ -35,6 +35,7 @@ from physworld.estimation.least_squares import Solution, descent, differences, m
 from physworld.estimation.simulations import Drive, Job, Runner, in_turn
 from physworld.estimation.uncertain import mistaken_drives
 from physworld.estimation.unknowns import at, bounds_of
+from physworld.estimation.whitening import moved, responses
 from physworld.scene import UNDEFORMED_AT_REST, Scene
 from physworld.twin.twin import Twin
 
@@ -319,19 +320,15 @@ class Search:
         return ()
 
     def shift_points(self, parameters: list[Parameter], theta: Array) -> bool:
-        """Move the tracked points by their mean residual: inside a solid, within a sheet and across it."""
+        """Move the tracked points by their mean residual: inside a solid, within a sheet and across it, with a rope's
+        sections."""
         sigma = self.scene.noise_sigma_m
-        lattice = self.twin.lattice
-        if self.scene.initial_state != UNDEFORMED_AT_REST or lattice.dim == 1 or not sigma:
+        if self.scene.initial_state != UNDEFORMED_AT_REST or not sigma:
             return False
         found = self.step("shift", lambda: {"shift": self._mean_offsets(parameters, theta, sigma)})["shift"]
         if found is None:
             return False
-        body, shift = self.twin.body, np.array(found)
-        body = replace(
-            body, points=body.points + shift[:, : lattice.dim], offsets=body.offsets + shift[:, lattice.dim :]
-        )
-        self.twin = replace(self.twin, body=body)
+        self.twin = moved(self.twin, np.array(found))
         return True
 
     def _mean_offsets(
@@ -352,7 +349,7 @@ class Search:
         frames = slice(self.begin, self.end)
         mask = self.scene.visible[frames]
         error = np.where(mask[..., None], self.scene.points[frames] - twin.track_nodes(nodes)[frames], 0.0)
-        gradient = material_frames(twin, nodes)[frames]
+        gradient = (responses if twin.lattice.dim == 1 else material_frames)(twin, nodes)[frames]
         local = np.linalg.solve(gradient, error[..., None])[..., 0]
         seen = np.maximum(mask.sum(axis=0), 1)[:, None]
         limit = _OFFSET_CLIP_SIGMAS * sigma
@@ -376,6 +373,26 @@ class Search:
             return {"changes": changes}
 
         found = [np.array(change) for change in self.step("controllers", measure)["changes"]]
+        return [change for change in found if np.isfinite(change).all()]
+
+    def elsewhere(self, twins: list[Twin]) -> list[Array]:
+        """Changes of the residual (m,) [m] from the first of some twins to each of the others.
+
+        Args:
+            twins: with the numbers that are compared.
+        """
+        if not twins or not self._reaches(len(twins)):
+            return []
+
+        def measure() -> dict[str, Any]:
+            jobs = [Job(twin, self.end) for twin in twins]
+            first, *others = (
+                self.compared(job, tracks)[0] for job, tracks in zip(jobs, self.run(jobs), strict=True)
+            )
+            self.simulations += len(jobs)
+            return {"changes": [(other - first).tolist() for other in others]}
+
+        found = [np.array(change) for change in self.step("elsewhere", measure)["changes"]]
         return [change for change in found if np.isfinite(change).all()]
 
     def step(self, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:

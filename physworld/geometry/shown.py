@@ -7,11 +7,13 @@ held, and so does what is too much, pixels of the gripper.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from physworld.arrays import Array
-from physworld.scene import Scene
+from physworld.scene import AS_MEASURED, Scene
 
 _LEAST = 100
 """Points of a cloud that show ends."""
@@ -29,6 +31,20 @@ def cloud_of_start(scene: Scene) -> Array | None:
     """The scene's cloud of the first frame (S, 3) [m], if it has one that shows a body's ends and no filling."""
     cloud = scene.surface_points
     return None if cloud is None or scene.rest_volume_points is not None or len(cloud) < _LEAST else cloud
+
+
+def misplaced(scene: Scene, axes: int) -> list[Scene]:
+    """The scene with its cloud one standard deviation off along each of its longest axes, a pixel of the camera.
+
+    Args:
+        scene: of a straight rope or a flat sheet at the start.
+        axes: 1 or 2; none where no cloud tells where the body ends.
+    """
+    cloud = cloud_of_start(scene)
+    if cloud is None or scene.initial_state == AS_MEASURED:
+        return []
+    longest = np.linalg.svd(cloud - cloud.mean(axis=0), full_matrices=False)[2][:axes]
+    return [replace(scene, surface_points=cloud + spacing_of(cloud) * axis) for axis in longest]
 
 
 def spacing_of(cloud: Array) -> float:

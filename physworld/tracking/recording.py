@@ -201,7 +201,8 @@ def edged_cloud(views: list[View], masks: list[Array]) -> Array:
         views: the cameras.
         masks: the object in each, (H, W) bool, or of no size.
     """
-    found, rng = [], np.random.default_rng(0)
+    found: list[Array] = []
+    rng = np.random.default_rng(0)
     for view, mask in zip(views, masks, strict=True):
         if not mask.size:
             continue

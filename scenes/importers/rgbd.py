@@ -136,7 +136,13 @@ def _as_its_kind(followed: Followed, options: ImportOptions, config: TrackConfig
     if kind not in ROD_KINDS or not isinstance(radius, int | float):
         return followed
     points = onto_middle(
-        followed.points, followed.visible, followed.cameras, followed.views, float(radius), config.depth_px
+        followed.points,
+        followed.visible,
+        followed.cameras,
+        followed.views,
+        followed.masks,
+        float(radius),
+        config.depth_px,
     )
     return replace(followed, points=points)
 

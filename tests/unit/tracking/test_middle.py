@@ -7,7 +7,7 @@ import pytest
 
 from physworld.camera import Camera
 from physworld.tracking.depth import without_strays
-from physworld.tracking.middle import onto_middle
+from physworld.tracking.middle import onto_middle, seen_before
 from physworld.tracking.recording import edged_cloud
 from physworld.tracking.view import View
 
@@ -16,6 +16,7 @@ FITS_M = 3e-4
 """What perspective leaves: a rope 6 mm thick at 1 m."""
 CAMERA = Camera(width=640, height=480, fx=800.0, fy=800.0, cx=320.0, cy=240.0, world_to_camera=np.eye(4))
 VIEW = View(CAMERA, lambda frame: np.zeros(0), lambda frame: np.zeros(0), 2)
+UNSEEN = np.zeros((0, 0), bool)
 
 
 def _line(angle_deg: float) -> np.ndarray:
@@ -45,16 +46,30 @@ def test_what_is_seen_of_a_rope_goes_onto_its_middle_line_however_it_leans(angle
     still, leaning = _line(0.0), _line(angle_deg)
     seen = np.stack([_seen(still), _seen(leaning)])
     assert np.linalg.norm(seen - [still, leaning], axis=2).min() > 0.7 * RADIUS_M
-    found = onto_middle(seen, np.ones((2, POINTS), bool), np.zeros(POINTS, int), [VIEW], RADIUS_M, 5)
+    found = onto_middle(
+        seen, np.ones((2, POINTS), bool), np.zeros(POINTS, int), [VIEW], [UNSEEN], RADIUS_M, 5
+    )
     off = found - np.stack([still, leaning])
     along = (leaning[-1] - leaning[0]) / np.linalg.norm(leaning[-1] - leaning[0])
     off[1] -= np.outer(off[1] @ along, along)
     assert np.linalg.norm(off, axis=2).max() < FITS_M
 
 
+def test_a_rope_of_which_the_edges_are_lost_is_seen_nearer() -> None:
+    mask = np.zeros((480, 640), bool)
+    mask[100:300, 310:330] = True
+    depth = np.where(mask, 1.0, 0.0)
+    radius = 10.0 / CAMERA.fx
+    view = View(CAMERA, lambda frame: np.zeros(0), lambda frame: depth, 1)
+    assert seen_before(view, mask, radius) == pytest.approx(0.25 * np.pi * radius, rel=0.02)
+    depth[:, 310:315] = depth[:, 325:] = 0.0  # the middle half is left
+    half = 0.5 * radius * (np.sqrt(0.75) + np.arcsin(0.5) / 0.5)
+    assert seen_before(view, mask, radius) == pytest.approx(half, rel=0.02)
+
+
 def test_what_is_wider_than_a_patch_stays_where_it_is_seen() -> None:
     seen = _seen(_line(0.0))[None]
-    found = onto_middle(seen, np.ones((1, POINTS), bool), np.zeros(POINTS, int), [VIEW], 0.02, 5)
+    found = onto_middle(seen, np.ones((1, POINTS), bool), np.zeros(POINTS, int), [VIEW], [UNSEEN], 0.02, 5)
     np.testing.assert_array_equal(found, seen)
 
 
