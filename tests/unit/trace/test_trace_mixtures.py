@@ -13,7 +13,6 @@ from physworld.effects.registry import effect
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace import TraceConfig, TraceResult, document, trace
 from physworld.trace.hypotheses import Hypothesis
-from physworld.trace.screening import Screened
 from physworld.trace.starts import Begun, Starts, distinct
 from physworld.twin.build import build_twin
 
@@ -94,12 +93,12 @@ def test_a_drag_stays_alone_and_no_other_basin_is_looked_for_where_a_near_start_
 ) -> None:
     asked: list[str] = []
 
-    def far(self: Starts, base: Hypothesis, one: Screened, *rest: object) -> Begun:
-        asked.append(one.candidate.effect)
-        return begin(self, base, one, *rest)  # type: ignore[arg-type]
+    def followed(self: Starts, base: Hypothesis, one: Begun, every: bool) -> Begun:
+        asked.append(one.screened.candidate.effect)
+        return follow(self, base, one, every)
 
-    begin = Starts.far
-    monkeypatch.setattr(Starts, "far", far)
+    follow = Starts.followed
+    monkeypatch.setattr(Starts, "followed", followed)
     found = traced(rate_per_s=4.0)
     assert [e.name for e in found.effects] == ["air_drag_linear"] and len(found.verdict.model.members) == 1
     assert asked == []
