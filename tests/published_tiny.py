@@ -64,6 +64,8 @@ def tiny_model(kind: str = "beam", dragged: bool = False) -> tuple[Scene, Twin, 
         drawn = {name: column.column_of(value) for name, value in told["effect_strengths"].items()}
         tracks.append(read_track(view.spec, arrays, SMALL.history, columns, drawn))
     training = TrainingConfig(steps=12, batch_size=2, look_ahead=2)
+    if dragged:  # a prior that leaves something to learn: a network that adds nothing to it has no strengths
+        training = replace(training, prior="modal", frame="world", validation_every=2)
     model = train(tracks, view.spec, SMALL, training, columns=columns).model
     phi, stands = np.zeros((view.spec.object_count, 2)), {column.name: 0.0} if dragged else {}
     return scene, twin, view.published(model.at_strengths(stands), phi, phi, Conditioning.of(model, stands))
