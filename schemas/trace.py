@@ -20,8 +20,8 @@ TraceState = Literal["pending", "ready", "failed", "cancelled"]
 class TraceConfig(Request):
     """Settings of a trace; the same scene and settings give the same answer, unless time is limited.
 
-    ``candidates`` are names of the effects' registry, none for all of them. The best ``confirmed`` are refitted with
-    the full simulator, in ``iterations`` Gauss-Newton steps; an answer has ``effects_at_most`` effects. After about
+    ``candidates`` are names of the effects' registry, none for all of them. Where little is left, the best
+    ``confirmed`` are refitted with the full simulator, else all that promise something, in ``iterations`` steps; an answer has ``effects_at_most`` effects. After about
     ``time_limit_s`` seconds of one attempt, those of waiting for workers included, searches are left and the answer is
     made of what there is; none: never. ``noise_m`` counts as every recording's noise per axis in metres, for a camera
     that sees more finely than the experiment repeats; none: what scenes declare.
@@ -37,7 +37,7 @@ class TraceConfig(Request):
         default=8,
         ge=1,
         le=32,
-        description="Candidates that are refitted with the full simulator.",
+        description="Candidates that are refitted with the full simulator where little is left.",
         examples=[8],
     )
     iterations: int = Field(

@@ -7,14 +7,14 @@ from the linear law, so the two need a recording that is fast and slow.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from physworld.effects.base import Effect, Strength
+from physworld.effects.on_mass import OnMass
 from physworld.engine.problem import Problem
 from physworld.engine.terms.term import BoundTerm
-from physworld.engine.updated.terms import ParticleBody
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -39,19 +39,13 @@ def quadratic_drag(
 
 
 @dataclass(frozen=True)
-class QuadraticDrag:
+class QuadraticDrag(OnMass):
     """Term of :class:`AirDragQuadratic`."""
 
     coefficient_per_m: float
 
-    def bind(self, problem: Problem) -> BoundQuadraticDrag:
-        """Device arrays."""
-        mass = wp.array(problem.nodal_mass(), dtype=wp.float64, device=problem.device)
-        return BoundQuadraticDrag(mass, self.coefficient_per_m)
-
-    def on_particles(self, body: ParticleBody) -> BoundQuadraticDrag:
-        """Device arrays for particles in the place of nodes."""
-        mass = wp.array(body.mass, dtype=wp.float64, device=body.problem.device)
+    def bound(self, mass: Any) -> BoundQuadraticDrag:
+        """See :meth:`OnMass.bound`."""
         return BoundQuadraticDrag(mass, self.coefficient_per_m)
 
 

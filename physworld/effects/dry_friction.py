@@ -9,15 +9,15 @@ die away. A body in the air rubs against nothing: beside drag and viscosity it n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from physworld.effects.base import Effect, Strength
+from physworld.effects.on_mass import OnMass
 from physworld.effects.places import gravity_size
 from physworld.engine.problem import Problem
 from physworld.engine.terms.term import BoundTerm
-from physworld.engine.updated.terms import ParticleBody
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -45,19 +45,13 @@ def dry_friction(
 
 
 @dataclass(frozen=True)
-class DryFrictionTerm:
+class DryFrictionTerm(OnMass):
     """Term of :class:`DryFriction`."""
 
     size_m_s2: float
 
-    def bind(self, problem: Problem) -> BoundDryFriction:
-        """Device arrays."""
-        mass = wp.array(problem.nodal_mass(), dtype=wp.float64, device=problem.device)
-        return BoundDryFriction(mass, self.size_m_s2, self.size_m_s2 / SLOW_M_S)
-
-    def on_particles(self, body: ParticleBody) -> BoundDryFriction:
-        """Device arrays for particles in the place of nodes."""
-        mass = wp.array(body.mass, dtype=wp.float64, device=body.problem.device)
+    def bound(self, mass: Any) -> BoundDryFriction:
+        """See :meth:`OnMass.bound`."""
         return BoundDryFriction(mass, self.size_m_s2, self.size_m_s2 / SLOW_M_S)
 
 

@@ -9,16 +9,17 @@ room, a rotating magnet. The push is ``gravity_tilt`` or ``wind``, the part with
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength, Variant
+from physworld.effects.on_mass import OnMass
 from physworld.effects.places import body_size, gravity_size
 from physworld.engine.problem import Problem
 from physworld.engine.terms.term import BoundTerm
-from physworld.engine.updated.terms import ParticleBody
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -44,20 +45,14 @@ def swirl(
 
 
 @dataclass(frozen=True)
-class SwirlTerm:
+class SwirlTerm(OnMass):
     """Term of :class:`Swirl`: spin (3,) [1/s^2], a point of the axis (3,) [m]."""
 
     spin_per_s2: tuple[float, float, float]
     centre_m: tuple[float, float, float]
 
-    def bind(self, problem: Problem) -> BoundSwirl:
-        """Device arrays."""
-        mass = wp.array(problem.nodal_mass(), dtype=wp.float64, device=problem.device)
-        return BoundSwirl(mass, wp.vec3d(*self.spin_per_s2), wp.vec3d(*self.centre_m))
-
-    def on_particles(self, body: ParticleBody) -> BoundSwirl:
-        """Device arrays for particles in the place of nodes."""
-        mass = wp.array(body.mass, dtype=wp.float64, device=body.problem.device)
+    def bound(self, mass: Any) -> BoundSwirl:
+        """See :meth:`OnMass.bound`."""
         return BoundSwirl(mass, wp.vec3d(*self.spin_per_s2), wp.vec3d(*self.centre_m))
 
 
@@ -108,12 +103,8 @@ class Swirl(Effect):
     @classmethod
     def variants(cls, twin: Twin) -> list[Variant]:
         """About the body's middle: about another axis it is this and a push, which has names of its own."""
-        return [
-            Variant(
-                cls.gates,
-                fixed={f"centre_{a}_m": float(c) for a, c in zip("xyz", _middle(twin), strict=True)},
-            )
-        ]
+        middle = {f"centre_{a}_m": float(c) for a, c in zip("xyz", _middle(twin), strict=True)}
+        return [Variant(cls.gates, fixed=middle)]
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds the term."""
@@ -123,7 +114,7 @@ class Swirl(Effect):
         return replace(problem, terms=(*problem.terms, SwirlTerm(spin, (centre[0], centre[1], centre[2]))))
 
 
-def _middle(twin: Twin) -> np.ndarray:
+def _middle(twin: Twin) -> Array:
     """Middle of the mass at the start, (3,) [m]."""
-    held: np.ndarray = np.average(twin.particles_start, axis=0, weights=twin.particle_mass)
-    return held
+    middle: Array = np.average(twin.particles_start, axis=0, weights=twin.particle_mass)
+    return middle

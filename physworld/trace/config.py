@@ -20,7 +20,7 @@ class TraceConfig:
         calibration: of the declared physics only; on coarser cells than a fit's, for a trace simulates a lot.
         blocks: time blocks of the training frames, at most; never shorter than ``shortest_block`` frames.
         shortest_block: frames.
-        confirmed: effects that are fitted with the full simulator beside the declared physics.
+        confirmed: effects that are fitted with the full simulator where little is left; else all are asked.
         additions: effects that are fitted on top of a set.
         iterations: Gauss-Newton iterations of a fit.
         effects_at_most: effects in one answer.

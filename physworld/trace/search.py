@@ -160,16 +160,13 @@ class Search:
         self._settle(size)
 
     def _worth(self, base: Hypothesis, scores: Sequence[Screened], count: int) -> list[list[Screened]]:
-        """The variants of every effect that is fitted beside ``base``, the most promising effect first."""
+        """The variants of the effects that are asked beside ``base``, the most promising first: of every effect where
+        the declared physics leaves much, for a score to first order says little of what is large."""
         by_effect: dict[str, list[Screened]] = {}
         for one in scores:
             by_effect.setdefault(one.candidate.effect, []).append(one)
-        order = list(by_effect.values())
-        if _near(base):
-            order = [own for own in order if own[0].share > WORTH]
-        if (
-            _near(base) or base.members
-        ):  # else a score to first order says little of an effect, which may be large
+        order = [own for own in by_effect.values() if own[0].share > WORTH or not _near(base)]
+        if _near(base) or base.members:
             order = order[:count]
         simpler = [name for own in order for name in own[0].candidate.contains]
         return order + [

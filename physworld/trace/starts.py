@@ -24,13 +24,13 @@ from physworld.trace.hypotheses import Hypothesis, Setting, Values
 from physworld.trace.posterior import removes
 from physworld.trace.screening import Screened
 
-_GROWING = (
-    0.4,
-    0.7,
-)  # shares of the training frames on which starts are ranked, and fitted one after the other
 _EARLY = 0.4  # share of the training frames on which starts are ranked
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
-_PROFILE = (5, 2, 2)  # stiffnesses beside which strengths are estimated, of each base
+_PROFILE = (
+    5,
+    2,
+    2,
+)  # stiffnesses beside which strengths are estimated, of each base; of a variant at least two
 _STIFFNESS = 1.0  # logarithms of the stiffness that they span, up and down
 _FOLLOWED = 3  # of all starts, the best on the early frames whose stiffness differs
 _ITERATIONS = 2  # of each of these, on the early frames
@@ -96,8 +96,7 @@ class Starts:
             if found is not None:
                 fits.append(((scaled.scale * found.misfit) ** 2, _named(found.unknowns, found.theta)))
         fits = sorted(fits, key=lambda fit: fit[0]) or [(min(errors), begun.starts[0])]
-        promised = self._promised(base, fits[0][0])
-        return Begun(begun.screened, [values for _, values in fits], promised)
+        return Begun(begun.screened, [values for _, values in fits], self._promised(base, fits[0][0]))
 
     def promised(self, base: Hypothesis, known: Hypothesis) -> float:
         """Share of what ``base`` leaves on the early frames that goes with a hypothesis that is fitted."""
@@ -179,6 +178,7 @@ def elsewhere(unknowns: Sequence[Unknown], own: Values) -> list[list[Values]]:
 
 
 def _bases(unknowns: Sequence[Unknown], own: Values) -> list[Values]:
+    """The place itself, and one more each with another value of what decides about phases: see :func:`elsewhere`."""
     bases = [own]
     for u in unknowns[1:]:
         if u.name in own and u.prior is None:

@@ -165,7 +165,8 @@ def _print(document: dict[str, Any]) -> None:
         print(f"  {name:<20} {'-' if error is None else format(1e3 * error, '.4g')}")
     for known in document["recordings"]:
         error, left = known["held_out"]["track_m"]["twin"], known["training"]["rms_m"]
-        print(f"  {known['scene']:<20} twin {1e3 * error:.4g}, training frames {1e3 * left:.4g} (rms)")
+        shown = "-" if error is None else format(1e3 * error, ".4g")
+        print(f"  {known['scene']:<20} twin {shown}, training frames {1e3 * left:.4g} (rms)")
     for known in document["agreement"]:
         _print_agreement(known)
     if document["local"] is not None:
