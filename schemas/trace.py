@@ -21,8 +21,9 @@ class TraceConfig(Request):
     """Settings of a trace; the same scene and settings give the same answer, unless time is limited.
 
     ``candidates`` are names of the effects' registry, none for all of them. Where little is left, the best
-    ``confirmed`` are refitted with the full simulator, else all that promise something, in ``iterations`` steps; an answer has ``effects_at_most`` effects. After about
-    ``time_limit_s`` seconds of one attempt, those of waiting for workers included, searches are left and the answer is
+    ``confirmed`` are refitted with the full simulator, else all that promise something, in ``iterations`` Gauss-Newton
+    steps; an answer has ``effects_at_most`` effects. After about ``time_limit_s`` seconds of one attempt, those of
+    waiting for workers included, searches are left and the answer is
     made of what there is; none: never. ``noise_m`` counts as every recording's noise per axis in metres, for a camera
     that sees more finely than the experiment repeats; none: what scenes declare.
     """
