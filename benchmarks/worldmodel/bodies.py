@@ -79,8 +79,15 @@ class Episodes:
         ]
 
 
-def episodes_of(name: str, folder: Path, config: WorldModelConfig) -> Episodes | None:
-    """The body's episodes, made once and kept in ``folder``; None where its scene is not on this machine."""
+def episodes_of(name: str, folder: Path, config: WorldModelConfig, taught: int = TAUGHT) -> Episodes | None:
+    """The body's episodes, made once and kept in ``folder``; None where its scene is not on this machine.
+
+    Args:
+        name: of the body.
+        folder: that keeps twins and episodes.
+        config: number of vertices of the graph.
+        taught: how many episodes there are to learn from.
+    """
     body = BODIES[name]
     if not body.folder.is_dir():
         return None
@@ -95,9 +102,9 @@ def episodes_of(name: str, folder: Path, config: WorldModelConfig) -> Episodes |
         ground_height_m=twin.ground_height_m,
         gravity_m_s2=np.asarray(scene.gravity_m_s2),
     )
-    path = folder / f"{name}-{config.vertices}.npz"
+    path = folder / f"{name}-{config.vertices}{'' if taught == TAUGHT else f'-{taught}'}.npz"
     if not path.exists():
-        made = {part: _simulated(scene, twin, spec, body, part) for part in PARTS}
+        made = {part: _simulated(scene, twin, spec, body, part, taught) for part in PARTS}
         arrays = {f"{part}.{k}": values for part, pair in made.items() for k, values in enumerate(pair)}
         np.savez(path.with_suffix(".part.npz"), allow_pickle=False, **arrays)
         path.with_suffix(".part.npz").replace(path)
@@ -118,14 +125,14 @@ def _twin_of(name: str, body: Body, folder: Path) -> Twin:
 
 
 def _simulated(
-    scene: Scene, twin: Twin, spec: GraphSpec, body: Body, part: str
+    scene: Scene, twin: Twin, spec: GraphSpec, body: Body, part: str, taught: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (E, T, V, 3) float32 and Φ (E, n, 2) float32 of accepted episodes of a part."""
     frames = TAUGHT_FRAMES if part == "taught" else JUDGED_FRAMES
     config = DemonstrationConfig(
         frames=frames, patterns=body.patterns, replay_share=0.0, control_substeps=SUBTICKS
     )
-    count = TAUGHT if part == "taught" else JUDGED
+    count = taught if part == "taught" else JUDGED
     paths: list[np.ndarray] = []
     fields: list[np.ndarray] = []
     tried = 0

@@ -50,16 +50,17 @@ def main() -> int:
     parser.add_argument("--budget", type=float, default=BUDGET_S, help="processor seconds a cell")
     parser.add_argument("--bodies", nargs="*", default=[*BODIES], choices=[*BODIES])
     parser.add_argument("--variants", nargs="*", default=[*VARIANTS], choices=[*VARIANTS])
+    parser.add_argument("--taught", type=int, default=TAUGHT, help="episodes to learn from")
     parser.add_argument("--seeds", nargs="*", type=int, default=[0])
     given = parser.parse_args()
     until = time.monotonic() + 60.0 * given.minutes
     for seed in given.seeds:
         for variant in given.variants:
             for body in given.bodies:
-                path = cell_path(given.cells, body, variant, seed, given.budget)
+                path = cell_path(given.cells, body, variant, seed, given.budget, given.taught)
                 if path.exists() or time.monotonic() > until:
                     continue
-                episodes = episodes_of(body, given.cells, MODEL)
+                episodes = episodes_of(body, given.cells, MODEL, given.taught)
                 if episodes is None:
                     print(f"{body}: left out, its scene is not on this machine", file=sys.stderr)
                     continue
@@ -68,7 +69,7 @@ def main() -> int:
                 path.write_text(json.dumps(found, indent=1))
                 errors = {part: round(1e3 * found[part]["mean_m"], 2) for part in JUDGED}
                 print(f"{body} {variant} {seed}: {errors} mm, {found['notes']}", file=sys.stderr, flush=True)
-    report = report_of(given.cells, given.budget)
+    report = report_of(given.cells, given.budget, given.taught)
     print(report.markdown())
     if given.json is not None:
         write_json(report, given.json)
@@ -77,12 +78,24 @@ def main() -> int:
     return 0
 
 
-def cell_path(folder: Path, body: str, variant: str, seed: int, budget_s: float) -> Path:
-    """Where the cell of these settings and this code lies."""
+def cell_path(
+    folder: Path, body: str, variant: str, seed: int, budget_s: float, taught: int = TAUGHT
+) -> Path:
+    """Where the cell of these settings and this code lies.
+
+    Args:
+        folder: of all cells.
+        body: by name.
+        variant: by name.
+        seed: of the training.
+        budget_s: processor seconds of it.
+        taught: episodes to learn from.
+    """
     held = {
         "variant": asdict(VARIANTS[variant]),
         "budget": budget_s,
         "model": asdict(MODEL),
+        "taught": taught,
         "code": code_digest(),
     }
     digest = hashlib.sha256(json.dumps(held, sort_keys=True, default=str).encode()).hexdigest()[:10]
@@ -155,13 +168,13 @@ def summary(errors: np.ndarray) -> dict[str, Any]:
     }
 
 
-def report_of(folder: Path, budget_s: float) -> Report:
+def report_of(folder: Path, budget_s: float, taught: int = TAUGHT) -> Report:
     """Every cell that is there."""
     rows, figures = [], {}
     for body in BODIES:
         baselines: dict[str, dict[str, Any]] = {}
         for variant in VARIANTS:
-            pattern = cell_path(folder, body, variant, 0, budget_s).name.replace(".0.", ".*.")
+            pattern = cell_path(folder, body, variant, 0, budget_s, taught).name.replace(".0.", ".*.")
             cells = [json.loads(path.read_text()) for path in sorted((folder / "cells").glob(pattern))]
             if not cells:
                 continue
@@ -184,7 +197,7 @@ def report_of(folder: Path, budget_s: float) -> Report:
         header=["body", "model", "unseen episodes [mm]", "turned grips [mm]", "steps", "processor seconds"],
         rows=rows,
         notes=[
-            f"{TAUGHT} episodes taught; errors over {JUDGED_FRAMES - GIVEN} frames, mean over vertices and episodes ± "
+            f"{taught} episodes taught; errors over {JUDGED_FRAMES - GIVEN} frames, mean over vertices and episodes ± "
             f"its standard error over episodes; {budget_s:.0f} processor seconds for each training, one thread.",
         ],
     )

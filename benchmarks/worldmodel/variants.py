@@ -14,15 +14,18 @@ from typing import Any
 import torch
 
 from benchmarks.worldmodel.bodies import SUBTICKS, Episodes
+from benchmarks.worldmodel.spectral import spectral
 from physworld.worldmodel.dataset import Track
 from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.model.graph import GraphSpec
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.rollout import rollout_tracks
 from physworld.worldmodel.training import train
 
 MODEL = WorldModelConfig(vertices=80)
 TRAINING = TrainingConfig(checkpoint_every=10**9)
 TIMED_STEPS = 4
+SMALL = {"message_passing_steps": 3, "hidden": 48}
 MOST_STEPS = 200_000
 
 Predict = Callable[[list[Track]], list[torch.Tensor]]
@@ -49,6 +52,7 @@ class Variant:
         architecture: of the network, what differs from the default.
         every: subticks between the model's ticks.
         trains: false for a prior alone, which takes what it takes.
+        mixes: whether the layers also mix along the graph's modes (``benchmarks.worldmodel.spectral``).
     """
 
     label: str
@@ -56,6 +60,7 @@ class Variant:
     architecture: dict[str, Any]
     every: int = SUBTICKS
     trains: bool = True
+    mixes: bool = False
 
     def learn(self, episodes: Episodes, budget_s: float, seed: int) -> Trained:
         """Train within ``budget_s`` processor seconds."""
@@ -64,13 +69,14 @@ class Variant:
         spec = replace(episodes.spec, dt_s=episodes.spec.dt_s * self.every / SUBTICKS)
         tracks = episodes.tracks("taught", self.every)
         training = replace(TRAINING, seed=seed, **self.settings)
+        network = spectral(tracks) if self.mixes else WorldModel
         if self.trains:
-            steps = _affordable(tracks, spec, config, training, budget_s)
+            steps = _affordable(tracks, spec, config, training, budget_s, network)
             training = replace(training, steps=steps, validation_every=max(1, steps // 10))
         else:
             training = replace(training, steps=0)
         begun = time.process_time()
-        result = train(tracks, spec, config, training)
+        result = train(tracks, spec, config, training, network=network)
         notes = {
             "processor_s": time.process_time() - begun,
             "steps": result.steps,
@@ -91,12 +97,15 @@ def _affordable(
     config: WorldModelConfig,
     training: TrainingConfig,
     budget_s: float,
+    network: Callable[..., WorldModel],
 ) -> int:
     """Optimiser steps for the budget, from what a few of them and the start take."""
     seconds = []
     for steps in (0, TIMED_STEPS):
         begun = time.process_time()
-        train(tracks, spec, config, replace(training, steps=steps, validation_every=MOST_STEPS))
+        train(
+            tracks, spec, config, replace(training, steps=steps, validation_every=MOST_STEPS), network=network
+        )
         seconds.append(time.process_time() - begun)
     a_step = (seconds[1] - seconds[0]) / TIMED_STEPS
     return int(max(10, min(MOST_STEPS, 0.9 * (budget_s - seconds[0]) / max(a_step, 1e-4))))
@@ -122,5 +131,23 @@ VARIANTS = {
         },
         {"message_passing_steps": 5},
         every=2,
+    ),
+    "small_network": Variant(
+        "network alone, grip's frame, 3 steps of width 48", {"prior": "none", "learning_rate": 3e-3}, SMALL
+    ),
+    "spectral_network": Variant(
+        "network alone, grip's frame, 3 steps of width 48 that mix along modes",
+        {"prior": "none", "learning_rate": 3e-3},
+        SMALL,
+        mixes=True,
+    ),
+    "small_grip": Variant(
+        "prior and network, grip's frame where it is chosen, 3 steps of width 48", {}, SMALL
+    ),
+    "spectral_grip": Variant(
+        "prior and network, grip's frame where it is chosen, 3 steps of width 48 that mix along modes",
+        {},
+        SMALL,
+        mixes=True,
     ),
 }

@@ -44,7 +44,7 @@ from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.inertia import one_step_residual
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
-from physworld.worldmodel.priors.choose import Prior, choose, fit_priors, prior_error, spec_for
+from physworld.worldmodel.priors.choose import choose, fit_priors, prior_error, spec_for
 from physworld.worldmodel.priors.prior_step import framed_prior, prior_step
 from physworld.worldmodel.rollout import mean_error, rollout_tracks
 
@@ -127,6 +127,7 @@ def train(
     validated: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
     device: str = "cpu",
+    network: Callable[..., WorldModel] = WorldModel,
 ) -> TrainingResult:
     """Train on ``tracks``; see the module's docstring.
 
@@ -144,6 +145,7 @@ def train(
         validated: called after each validation with (step, open-loop error [m]).
         cancelled: asked before each step; true raises TrainingCancelled.
         device: of the network while it learns, "cpu" or "cuda:0"; data, priors and result are on the CPU.
+        network: builds it from the arguments of :class:`WorldModel`.
     """
     if not tracks:
         raise DatasetUnusable("no episode to train on")
@@ -167,7 +169,10 @@ def train(
         spec,
         lambda track: one_step_residual(ahead, track.positions, track.phi, spec.object_count, h),
     )
-    run = _start(config, spec, scales, prior, columns, training, torch.device(device))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(training.seed)
+        model = network(config, spec, scales, prior, columns).to(device)
+    run = _start(model, scales, training)
     identity = _identity(config, training, scales)
     if checkpoint is not None:
         _restore(run, checkpoint, identity)
@@ -234,22 +239,11 @@ def open_loop_error(model: WorldModel, tracks: list[Track]) -> float:
     return mean_error(rollout_tracks(model, tracks), tracks, model.spec)
 
 
-def _start(
-    config: WorldModelConfig,
-    spec: GraphSpec,
-    scales: Normalisation,
-    prior: Prior,
-    columns: tuple[PhiColumn, ...],
-    training: TrainingConfig,
-    device: torch.device,
-) -> _Run:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(training.seed)
-        model = WorldModel(config, spec, scales, prior, columns).to(device)
+def _start(model: WorldModel, scales: Normalisation, training: TrainingConfig) -> _Run:
     generator = torch.Generator().manual_seed(training.seed)
     optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
     gradient = GraphedLoss() if GraphedLoss.fits(model) else plain_loss
-    return _Run(model, copy.deepcopy(model), optimiser, generator, Scales(scales, spec), gradient)
+    return _Run(model, copy.deepcopy(model), optimiser, generator, Scales(scales, model.spec), gradient)
 
 
 def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, look_ahead: int) -> None:
