@@ -8,7 +8,6 @@ that goes beyond its limits, or crashes its reader, is a refusal like any other,
 from __future__ import annotations
 
 import json
-import os
 import queue
 import subprocess
 import sys
@@ -22,12 +21,11 @@ from typing import Any
 import structlog
 
 from physworld_scenes.errors import SceneInvalid
+from physworld_scenes.limited import environment
 from physworld_schemas.base import FieldError
 from physworld_services.api.errors import ApiProblem
 
 ROOT = Path(__file__).parents[2]
-PASSED_ON = ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL", "PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH")
-"""Of the environment: a reader of hostile files has no use for addresses and keys."""
 STOPPED = {
     "cpu": "reading it takes more processor time than a file of its size may",
     "killed": "reading it takes more processor time or memory than a file of its size may",
@@ -156,8 +154,7 @@ class _Parser:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "physworld_services.api.parser_process"],
                 cwd=ROOT,
-                env={name: os.environ[name] for name in PASSED_ON if name in os.environ}
-                | {"OMP_NUM_THREADS": "1"},
+                env=environment(),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 text=True,
