@@ -9,11 +9,12 @@ environment.
 
 A request is ``{"folder", "filename", "name", "options", "look"}``: the upload lies in the folder as ``upload``; the
 child leaves ``scene.zip``, the canonical archive, and ``found.json`` beside it; with ``look`` what an import would
-guess alone. An answer is ``{"outcome", "cpu_s", "peak_bytes"}``.
+guess alone, with ``pictures`` what cameras show first. An answer is ``{"outcome", "cpu_s", "peak_bytes"}``.
 """
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
 import os
@@ -31,6 +32,7 @@ from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.facts import facts_of
 from physworld_scenes.importers import ImportOptions, import_any, look_at
 from physworld_scenes.importers.library import limit_here
+from physworld_scenes.importers.unpacked import first_pictures, media_type_of, unpacked
 from physworld_scenes.limited import (
     FAULT_CHARACTERS,
     MEBIBYTE,
@@ -47,6 +49,7 @@ CPU_S, BYTES_A_CPU_S = 4, 16 * MEBIBYTE
 WALL_S, WALL_A_CPU_S = 30, 4
 MEMORY_BYTES, MEMORY_A_BYTE = 256 * MEBIBYTE, 8
 OUTPUT_BYTES = 1152 * MEBIBYTE
+SHOWN_BYTES = 32 * MEBIBYTE
 REFUSED, TOO_LARGE = 2, 3  # exit statuses of a child: faults are in found.json; memory or output ran out
 
 
@@ -91,6 +94,9 @@ def _read(request: dict[str, Any]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # answers are the parent's
         limits_of((folder / UPLOAD).stat().st_size).impose()
         tempfile.tempdir = str(folder)  # what a killed child leaves goes with the upload
+        if request.get("pictures"):
+            (folder / FOUND).write_text(json.dumps(_pictured(folder, request["filename"])))
+            return 0
         data = (folder / UPLOAD).read_bytes()
         options = ImportOptions(**request["options"])
         limit_here()
@@ -119,6 +125,20 @@ def _looked(data: bytes, filename: str, options: ImportOptions) -> dict[str, Any
         "guesses": [dict(zip(keys, guess, strict=True)) for guess in guesses],
         "lines": [line[:FAULT_CHARACTERS] for line in lines[:MOST_FAULTS]],
     }
+
+
+def _pictured(folder: Path, filename: str) -> dict[str, Any]:
+    """What each camera of an archive of pictures shows first, as far as it is small enough to be shown."""
+    place, shown, left = folder / "pictures", [], SHOWN_BYTES
+    place.mkdir()
+    form, cameras = first_pictures(unpacked(folder / UPLOAD, filename, place))
+    for number, (name, frames, picture) in enumerate(cameras):
+        camera: dict[str, Any] = {"camera": number, "name": name, "frames": frames}
+        if picture and len(picture) <= left:
+            left -= len(picture)
+            camera |= {"media_type": media_type_of(picture), "data": base64.b64encode(picture).decode()}
+        shown.append(camera)
+    return {"form": form, "cameras": shown}
 
 
 def _refuse(folder: Path, faults: list[FieldError]) -> int:

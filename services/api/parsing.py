@@ -79,12 +79,20 @@ class Parsers:
             {"folder": str(folder), "filename": filename, "name": None, "options": options, "look": True},
         )
 
+    def pictures(self, folder: Path, filename: str) -> dict[str, Any]:
+        """What the archive or film ``upload`` in ``folder`` shows first: a ``TrackingPreview``'s fields.
+
+        Raises:
+            SceneInvalid, ApiProblem: as of ``parse``.
+        """
+        request = {"folder": str(folder), "filename": filename, "name": None, "options": {}, "pictures": True}
+        return self._asked(folder, request)
+
     def _asked(self, folder: Path, request: dict[str, Any]) -> dict[str, Any]:
         """What the reader found. Raises SceneInvalid."""
-        filename = request["filename"]
+        filename, size = request["filename"], (folder / "upload").stat().st_size
         with self._one() as parser:
             answer = parser.ask(request)
-        size = (folder / "upload").stat().st_size
         log.info("upload_read", bytes=size, **answer)
         outcome = answer["outcome"]
         if outcome in STOPPED:

@@ -11,6 +11,7 @@ import contextlib
 import errno
 import json
 import os
+import re
 import selectors
 import shutil
 import subprocess
@@ -38,6 +39,8 @@ STOPPED = {
     "killed": "following it took more memory than this machine gives",
     "crashed": "its content crashed the process that read it",
 }
+OUT_OF_MEMORY = re.compile("memory alloc|allocate memory|bad_alloc", re.IGNORECASE)
+"""How native libraries say that they met the limit on memory when they end a process."""
 MEDIA_TYPES = {
     files.LOOK: "image/png",
     files.CAMERA: "application/json",
@@ -141,13 +144,10 @@ def _failure(status: int, folder: Path, filename: str) -> Exception:
     lines = (folder / "stderr").read_text(errors="replace").strip().splitlines()
     last = lines[-1][:300] if lines else f"status {status}"
     limits = {"cpu_s": files.LIMITS.cpu_s, "wall_s": files.LIMITS.wall_s}
-    if status == files.NO_MEMORY or (status > 0 and NO_MEMORY.search(last)):
+    if status == files.NO_MEMORY or (status > 0 and OUT_OF_MEMORY.search(last)):
         told = f"following it takes more than {files.LIMITS.memory_bytes} bytes of memory; give fewer frames or points"
     elif status < 0:
         told = STOPPED[stopped_by(status)].format(**limits)
     else:
-        lines = (folder / "stderr").read_text(errors="replace").strip().splitlines()
-        return RuntimeError(
-            f"following {filename} failed: {lines[-1][:300] if lines else f'status {status}'}"
-        )
+        return RuntimeError(f"following {filename} failed: {last}")
     return SceneInvalid([FieldError(loc=[filename[:200]], msg=told)])
