@@ -85,8 +85,8 @@ class Parsers:
         Raises:
             SceneInvalid, ApiProblem: as of ``parse``.
         """
-        request = {"folder": str(folder), "filename": filename, "name": None, "options": {}, "pictures": True}
-        return self._asked(folder, request)
+        request: dict[str, Any] = {"folder": str(folder), "filename": filename, "name": None, "options": {}}
+        return self._asked(folder, request | {"pictures": True})
 
     def _asked(self, folder: Path, request: dict[str, Any]) -> dict[str, Any]:
         """What the reader found. Raises SceneInvalid."""

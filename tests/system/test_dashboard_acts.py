@@ -248,7 +248,11 @@ def test_pictures_are_looked_at_a_box_is_drawn_and_a_job_follows_the_object(
     expect(visit.page.locator("[data-told]")).to_contain_text("plate.zip: 1 camera, 12 pictures each")
     canvas = visit.page.get_by_role("img", name="First picture of the camera, with the boxes")
     expect(canvas).to_have_attribute("width", "160")
-    assert violations(visit) == []
+    for scheme, width in (("dark", 360), ("light", 1280)):
+        visit.page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+        visit.page.set_viewport_size({"width": width, "height": 900})
+        assert violations(visit) == []
+        assert visit.page.evaluate("document.documentElement.scrollWidth") <= width
     canvas.scroll_into_view_if_needed()
     area = canvas.bounding_box()
     assert area is not None

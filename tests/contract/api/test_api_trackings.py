@@ -13,8 +13,8 @@ import httpx
 import pytest
 from api_service import Service, assert_problem, bundle
 from conftest import MAX_UPLOAD_BYTES
-from planar_filmed import Film
 from PIL import Image
+from planar_filmed import Film
 from tracking_pictured import FRAMES, HEIGHT, WIDTH, write
 
 from physworld_scenes.bundle import bundle_from_bytes
