@@ -1,4 +1,4 @@
-"""Reading of archives that strangers send: in memory, by name, within limits, never unpacked to disk.
+"""Reading of archives that strangers send: by name, within limits, in memory or unpacked to a folder.
 
 A zip or a tar (plain, gzip) is read member by member. Refused, each with its name and numbers: a path that
 climbs out of the archive, is absolute, names a drive or is not UTF-8; a link, a device, a sparse or an encrypted
@@ -12,6 +12,7 @@ a header claims before it looks at the data, and no array of Python objects is e
 
 from __future__ import annotations
 
+import errno
 import io
 import math
 import re
@@ -21,9 +22,11 @@ import tarfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import IO
 
 import numpy as np
@@ -56,6 +59,11 @@ TAR_EXTENSION_BYTES = 4096
 TAR_EXTENSIONS_IN_A_ROW = 3
 TAR_DIGITS = 20
 """Of the length that a PAX record begins with. Older interpreters parse longer ones for minutes: CVE-2024-6232."""
+
+
+MOST_DEPTH, LONGEST_NAME = 8, 255
+NO_SUCH_NAME = frozenset({errno.EEXIST, errno.EINVAL, errno.EISDIR, errno.ENAMETOOLONG, errno.ENOTDIR})
+"""What a file system says of names that clash (a file that is a folder, too) or that it does not take."""
 
 
 class ArchiveRefused(ValueError):
@@ -127,10 +135,48 @@ def read_archive(
     Raises:
         ArchiveRefused: damaged, hostile, too large, or no archive at all.
     """
-    if not is_zip(data) and not is_tar(data):
-        raise ArchiveRefused(f"neither a zip nor a tar (it begins with {data[:8].hex(' ') or 'nothing'})")
     with _damage_told(f"the archive of {len(data)} bytes"):
-        return _read_zip(data, wanted, limits) if is_zip(data) else _read_tar(data, wanted, limits)
+        return {
+            member.name: member.content()
+            for member in _members(io.BytesIO(data), len(data), limits)
+            if member.name.rpartition("/")[2] in wanted
+        }
+
+
+def unpack(archive: Path, folder: Path, limits: ArchiveLimits = DEFAULT_LIMITS) -> int:
+    """Write the files of an archive below a folder, which is empty; how many.
+
+    Every name is checked before anything is written, and no link is ever made, so nothing lands outside.
+
+    Args:
+        archive: a zip or a tar.
+        folder: is there.
+        limits: on members and bytes.
+
+    Raises:
+        ArchiveRefused: damaged, hostile, too large, no archive at all, or with names that no folder takes.
+        OSError: the disk is full.
+    """
+    size, count = archive.stat().st_size, 0
+    with archive.open("rb") as raw, _damage_told(f"the archive of {size} bytes"):
+        for member in _members(raw, size, limits):
+            depth, longest = member.name.count("/") + 1, max(map(len, member.name.encode().split(b"/")))
+            if depth > MOST_DEPTH or longest > LONGEST_NAME:
+                raise ArchiveRefused(
+                    f"{member.name[:80]!r} lies {depth} levels deep, the longest of its names has {longest} bytes; "
+                    f"at most {MOST_DEPTH} levels and {LONGEST_NAME} bytes are unpacked"
+                )
+            target = folder / member.name
+            try:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with target.open("xb") as file:
+                    member.copy_to(file)
+            except OSError as error:
+                if error.errno not in NO_SUCH_NAME:
+                    raise
+                raise ArchiveRefused(f"{member.name!r} cannot be written: {error.strerror}") from error
+            count += 1
+    return count
 
 
 def read_arrays(
@@ -144,7 +190,9 @@ def read_arrays(
     if not is_zip(data):
         raise ArchiveRefused(f"not an npz (it begins with {data[:8].hex(' ') or 'nothing'})")
     with _damage_told(f"the npz of {len(data)} bytes"):
-        files = _read_zip(data, None, limits)
+        files = {
+            member.name: member.content() for member in _zip_members(io.BytesIO(data), len(data), limits)
+        }
     return {
         name.removesuffix(".npy"): parse_array(name, content, text=text) for name, content in files.items()
     }
@@ -161,15 +209,56 @@ def _damage_told(what: str) -> Iterator[None]:
         raise ArchiveRefused(f"{what} is damaged or truncated: {error}") from error
 
 
-def _read_zip(data: bytes, wanted: frozenset[str] | None, limits: ArchiveLimits) -> dict[str, bytes]:
-    """Wanted members of a zip (all of them for None)."""
-    _check_directory(data, limits)
-    found: dict[str, bytes] = {}
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+@dataclass(frozen=True)
+class _Member:
+    """A file in an archive, whose name, type and size were checked; ``open`` gives its content, once."""
+
+    name: str
+    size: int
+    open: Callable[[], IO[bytes]]
+
+    def content(self) -> bytes:
+        """All of it. Raises ArchiveRefused where it is not as long as it declares."""
+        with self.open() as stream:
+            content = stream.read(self.size)
+            self._require(len(content), stream)
+        return content
+
+    def copy_to(self, file: IO[bytes]) -> None:
+        """Write it, a piece at a time. Raises ArchiveRefused where it is not as long as it declares."""
+        with self.open() as stream:
+            held = 0
+            while piece := stream.read(min(CHUNK_BYTES, self.size - held)):
+                file.write(piece)
+                held += len(piece)
+            self._require(held, stream)
+
+    def _require(self, held: int, stream: IO[bytes]) -> None:
+        if held != self.size or stream.read(1):
+            raise ArchiveRefused(f"{self.name} declares {self.size} bytes and holds {held} or more")
+
+
+def _members(raw: IO[bytes], size: int, limits: ArchiveLimits) -> Iterator[_Member]:
+    """The files in a zip or a tar, in their order."""
+    head = raw.read(TAR_BLOCK)
+    raw.seek(0)
+    if is_zip(head):
+        yield from _zip_members(raw, size, limits)
+    elif is_tar(head):
+        yield from _tar_members(raw, size, limits, inflate=head[:2] == GZIP_MAGIC)
+    else:
+        raise ArchiveRefused(f"neither a zip nor a tar (it begins with {head[:8].hex(' ') or 'nothing'})")
+
+
+def _zip_members(raw: IO[bytes], size: int, limits: ArchiveLimits) -> Iterator[_Member]:
+    """The files in a zip, once every name and size in it was checked."""
+    _check_directory(raw, size, limits)
+    found: list[tuple[str, zipfile.ZipInfo]] = []
+    with zipfile.ZipFile(raw) as archive:
         entries = archive.infolist()
         if len(entries) > limits.members:
             raise ArchiveRefused(f"{len(entries)} members, at most {limits.members} are allowed")
-        _check_total(sum(entry.file_size for entry in entries), len(data), limits, "declares")
+        _check_total(sum(entry.file_size for entry in entries), size, limits, "declares")
         seen: set[str] = set()
         for entry in entries:
             name = _checked_name(entry.orig_filename, seen)
@@ -182,18 +271,15 @@ def _read_zip(data: bytes, wanted: frozenset[str] | None, limits: ArchiveLimits)
                 raise ArchiveRefused(
                     f"{name} uses compression method {entry.compress_type}, only deflate is read"
                 )
-            if entry.is_dir() or not _is_wanted(name, wanted):
-                continue
-            with archive.open(entry) as stream:
-                found[name] = _read_member(stream, entry.file_size, name)
-    return found
+            if not entry.is_dir():
+                found.append((name, entry))
+        for name, entry in found:
+            yield _Member(name, entry.file_size, partial(archive.open, entry))
 
 
-def _read_tar(data: bytes, wanted: frozenset[str], limits: ArchiveLimits) -> dict[str, bytes]:
-    """Wanted members of a tar. It is read as a stream, so that nothing in it can make the reader go back."""
-    found: dict[str, bytes] = {}
-    compressed = data[:2] == GZIP_MAGIC
-    metered = _MeteredStream(io.BytesIO(data), len(data), limits, inflate=compressed)
+def _tar_members(raw: IO[bytes], size: int, limits: ArchiveLimits, *, inflate: bool) -> Iterator[_Member]:
+    """The files in a tar. It is read as a stream, so that nothing in it can make the reader go back."""
+    metered = _MeteredStream(raw, size, limits, inflate=inflate)
     with tarfile.open(fileobj=metered, mode="r|") as archive:  # type: ignore[call-overload]
         seen: set[str] = set()
         for count, member in enumerate(archive, start=1):
@@ -206,22 +292,28 @@ def _read_tar(data: bytes, wanted: frozenset[str], limits: ArchiveLimits) -> dic
                 )
             if member.size < 0:
                 raise ArchiveRefused(f"{name} declares {member.size} bytes")
-            _check_total(member.size, len(data), limits, f"{name} declares")
-            if member.isdir() or not _is_wanted(name, wanted):
-                continue
-            stream = archive.extractfile(member)
-            if stream is None:
-                raise ArchiveRefused(f"{name} cannot be read")
-            found[name] = _read_member(stream, member.size, name)
-    return found
+            _check_total(member.size, size, limits, f"{name} declares")
+            if not member.isdir():
+                yield _Member(name, member.size, partial(_opened, archive, member, name))
 
 
-def _check_directory(data: bytes, limits: ArchiveLimits) -> None:
+def _opened(archive: tarfile.TarFile, member: tarfile.TarInfo, name: str) -> IO[bytes]:
+    stream = archive.extractfile(member)
+    if stream is None:
+        raise ArchiveRefused(f"{name} cannot be read")
+    return stream
+
+
+def _check_directory(raw: IO[bytes], length: int, limits: ArchiveLimits) -> None:
     """Refuse a zip by the size that its end record claims for the directory, before anybody parses it."""
-    at = data.rfind(END_OF_ZIP, max(0, len(data) - END_OF_ZIP_SEARCHED))
-    if at < 0 or at + 22 > len(data):
-        raise ArchiveRefused(f"the zip of {len(data)} bytes is damaged or truncated: it has no end record")
-    entries, size = struct.unpack_from("<HI", data, at + 10)
+    start = max(0, length - END_OF_ZIP_SEARCHED)
+    raw.seek(start)
+    tail = raw.read(length - start)
+    raw.seek(0)
+    at = tail.rfind(END_OF_ZIP)
+    if at < 0 or at + 22 > len(tail):
+        raise ArchiveRefused(f"the zip of {length} bytes is damaged or truncated: it has no end record")
+    entries, size = struct.unpack_from("<HI", tail, at + 10)
     allowed = limits.members * ZIP_ENTRY_BYTES
     if entries == 0xFFFF or size == 0xFFFFFFFF or entries > limits.members or size > allowed:
         raise ArchiveRefused(
@@ -320,17 +412,6 @@ class _MeteredStream:
             if not source:
                 raise EOFError("the gzip stream ends early")
         return b""
-
-
-def _read_member(stream: IO[bytes], declared: int, name: str) -> bytes:
-    content = stream.read(declared)
-    if len(content) != declared or stream.read(1):
-        raise ArchiveRefused(f"{name} declares {declared} bytes and holds {len(content)} or more")
-    return content
-
-
-def _is_wanted(name: str, wanted: frozenset[str] | None) -> bool:
-    return wanted is None or name.rpartition("/")[2] in wanted
 
 
 def _checked_name(raw: str, seen: set[str]) -> str:

@@ -10,6 +10,7 @@ from pydantic import Field
 from physworld_schemas.base import RATIO, UNIT_BESIDE, Problem, Reference, Resource
 
 JobKind = Literal[
+    "tracking",
     "check",
     "fit",
     "trace",

@@ -13,12 +13,8 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Unit = Literal["m", "cm", "mm", "in", "ft"]
 
 
-class SceneImport(Request):
-    """What a foreign recording (tables of markers, PhysTwin) does not say of itself: ``options`` of POST /v1/scenes.
-
-    What is left out is guessed where that can be done; ``POST /v1/scenes/preview`` says how. Bundles say everything
-    themselves: of these they take ``name`` only.
-    """
+class RecordingFacts(Request):
+    """What a person knows of a recording, whatever its form."""
 
     name: str | None = Field(
         default=None,
@@ -59,6 +55,18 @@ class SceneImport(Request):
     body: dict[str, Any] = Field(
         default_factory=dict, description="Keys of `scene.json`'s body.", examples=[{"density_kg_m3": 1000.0}]
     )
+    up: Axis | None = Field(
+        default=None, description="Axis of the recording that points up; null: guessed.", examples=["y"]
+    )
+
+
+class SceneImport(RecordingFacts):
+    """What a foreign recording (tables of markers, PhysTwin) does not say of itself: ``options`` of POST /v1/scenes.
+
+    What is left out is guessed where that can be done; ``POST /v1/scenes/preview`` says how. Bundles say everything
+    themselves: of these they take ``name`` only.
+    """
+
     controllers: tuple[str, ...] | None = Field(
         default=None,
         description="Markers, groups of them or rigid bodies that hold the object, * for any letters; `none`: nothing "
@@ -69,9 +77,6 @@ class SceneImport(Request):
         default=None,
         description="Likewise those on the object, in the order that the points shall have; null: all others.",
         examples=[["M1", "M2"]],
-    )
-    up: Axis | None = Field(
-        default=None, description="Axis of the recording that points up; null: guessed.", examples=["y"]
     )
     unit: Unit | None = Field(
         default=None, description="Unit of a table of markers; null: as it says, or guessed.", examples=["mm"]

@@ -97,6 +97,7 @@ PAGES = {
     "keys": "/keys",
     "audit": "/keys/audit",
     "sessions": "/sessions",
+    "tracking": "/trackings",
     "not-found": "/nothing",
 } | {f"start-{kind}": f"/start/{kind}" for kind in STARTS}
 SMALL_FIT = FitConfig(particle_budget=300, max_simulations=80, numerics=False)

@@ -17,6 +17,7 @@ from physworld_storage import resources
 from physworld_storage.clock import database_now
 from physworld_storage.database import Database
 from physworld_storage.errors import StorageError
+from physworld_storage.jobs.kinds import tracking
 from physworld_storage.orphans import remove_orphan_artifacts
 from physworld_storage.scratch import ScratchStore
 from physworld_storage.settings import Settings
@@ -25,7 +26,7 @@ from physworld_storage.tables import DatasetRow, JobRow
 logger = logging.getLogger(__name__)
 
 ALL_EVERY_S = 86400.0  # of all artifacts and all sealed datasets, which may be many
-FAILED_KEPT = timedelta(days=7)  # journals and checkpoints of a failed job
+FAILED_KEPT = timedelta(days=7)  # journals, checkpoints and uploaded pictures of a failed job
 SWEPT_FOR = timedelta(days=1)  # a dataset, so long after its end
 
 
@@ -54,6 +55,8 @@ class Housekeeping:
             remove_orphan_episodes(self._settings, self._database)
             if time.monotonic() >= self._all_due:
                 episodes = remove_orphan_episodes(self._settings, self._database, sealed=True)
+                with self._database.session() as session:
+                    tracking.forget_uploads(session, database_now(session) - FAILED_KEPT)
                 removed = remove_orphan_artifacts(self._settings, self._database)
                 self._all_due = time.monotonic() + ALL_EVERY_S
                 if episodes or removed:

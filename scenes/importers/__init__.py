@@ -38,7 +38,8 @@ BUNDLE = Importer(
 IMPORTERS = (NPZ, BUNDLE, *FORMS, phystwin.IMPORTER, PLAIN)
 """The first that recognises a file reads it."""
 FOLDERS = (pictures.IMPORTER, film.IMPORTER)
-"""Forms that are folders or films: the command ``physworld import`` reads them, the service does not."""
+"""Forms that are folders or films: trackings (``physworld_scenes.importers.unpacked``) and ``physworld import`` read
+them."""
 
 
 def import_any(
@@ -93,7 +94,7 @@ def importer_of(data: bytes, name: str = "", options: ImportOptions | None = Non
         if importer.recognises(data, name):
             return importer
     if film.begins_as_film(data):
-        message = "is a film, in which the service follows nothing: `physworld import` makes a scene of it to upload"
+        message = "is a film: `POST /v1/trackings` and `physworld import` make a scene of it"
         raise SceneInvalid([FieldError(loc=[name or "file"], msg=message)])
     start = data[:8].hex(" ") or "nothing"
     forms = ", nor ".join(importer.title for importer in IMPORTERS)

@@ -261,7 +261,7 @@ IMPORTER = FolderImporter(
     "film",
     "film, or folder of pictures, of a motion in a plane",
     (".mp4", ".mkv", ".avi"),
-    "one colour camera; a board or a length in the plane gives the scale, what is in a box is followed: by "
-    "`physworld import` alone",
+    "one colour camera; a board or a length in the plane gives the scale, what is in a box is followed: "
+    "`physworld import`, `POST /v1/trackings`",
     is_film,
 )

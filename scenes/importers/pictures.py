@@ -80,7 +80,7 @@ def read_pictures(folder: Path, depth_scale: float | None = None, frames: slice 
     colour_root, depth_root = _part(folder, COLOUR_FOLDERS), _part(folder, DEPTH_FOLDERS)
     if colour_root is None or depth_root is None:
         raise refused(folder.name, "holds no folder color beside a folder depth")
-    colours, depths = _cameras_in(colour_root), _cameras_in(depth_root)
+    colours, depths = cameras_in(colour_root), cameras_in(depth_root)
     if len(colours) != len(depths) or (len(colours) > 1 and list(colours) != list(depths)):
         raise refused(
             "depth",
@@ -151,7 +151,15 @@ def _part(folder: Path, names: tuple[str, ...]) -> Path | None:
     return next((folder / name for name in names if (folder / name).is_dir()), None)
 
 
-def _cameras_in(root: Path) -> dict[str, list[Path]]:
+def colours_of(folder: Path) -> Path:
+    """The folder with the colours of a folder of pictures. Raises SceneInvalid."""
+    root = _part(folder, COLOUR_FOLDERS)
+    if root is None:
+        raise refused(folder.name, "holds no folder color")
+    return root
+
+
+def cameras_in(root: Path) -> dict[str, list[Path]]:
     """Files of every camera by its name, in the order of their numbers: subfolders, films, or the folder itself."""
     entries = sorted(root.iterdir(), key=_natural)
     folders = [entry for entry in entries if entry.is_dir()]
@@ -267,6 +275,6 @@ IMPORTER = FolderImporter(
     "folder of pictures with depth",
     (),
     "one or several calibrated cameras, PhysTwin's or Open3D's layout; what is in a box is "
-    "followed, or tracks/CAMERA.npz of another tracker is taken: by `physworld import` alone",
+    "followed, or tracks/CAMERA.npz of another tracker is taken: `physworld import`, `POST /v1/trackings`",
     is_pictures,
 )

@@ -43,7 +43,10 @@ GROUND_NEAR_M = 0.05
 LEVEL_DEG = 15.0
 UNSEEN_WARNING = 0.1
 
+STAGES = ("reading", "tracking", "cloud", "gripping", "scene")
 Told = Callable[[int, int, str], None]
+"""Told of progress: frames done, frames in all, and a message that begins with the stage and perhaps goes on behind a
+comma."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +89,13 @@ def read_folder(
         folder: one of the layouts of :mod:`physworld_scenes.importers.pictures`.
         options: name, kind, rate, noise, gravity, body.
         pictures: see there.
-        told: progress: frames done, frames in all, a message.
+        told: progress of the ``STAGES``.
 
     Raises:
         SceneInvalid: files are missing or damaged, or the object or its gripper cannot be followed; with the numbers.
     """
     options, given = options or ImportOptions(), pictures or PictureOptions()
+    told(0, 1, "reading")
     recording = read_pictures(folder, given.depth_scale, slice(given.first, given.last))
     warnings: list[str] = []
     for name, named in (("box", given.boxes), ("mask", given.masks), ("tracks", given.tracks)):
@@ -107,7 +111,8 @@ def read_folder(
         made = [mask_file(given.masks.get(number), view.camera) for number, view in enumerate(views)]
         masks = masks_of(views, boxes, made, None if ground is None else ground.height)
         config = TrackConfig(points=given.points)
-        followed = follow_all(views, masks, config, told, tracks, estimate_noise)
+        followed = follow_all(views, masks, config, in_stage("tracking", told), tracks, estimate_noise)
+        told(0, 1, "cloud")
         followed = _as_its_kind(followed, options, config)
         warnings += _disagreements(masks, followed)
         fps = options.fps or recording.fps
@@ -115,9 +120,11 @@ def read_folder(
             fps = DEFAULT_FPS
             warnings.append(f"the folder says no rate: {fps:g} frames per second are assumed")
         times = np.arange(views[0].frames) / fps
+        told(0, 1, "gripping")
         path = None if given.grip is None else gripper_path(views, given.grip, times)
     except TrackingFailed as error:
         raise refused(folder.name, str(error)) from error
+    told(0, 1, "scene")
     declared, arrays = _parts(folder, options, given, recording, followed, path, ground, fps, warnings)
     declared["notes"] |= {"up": up, "layout": recording.layout}
     if tracks:
@@ -126,6 +133,11 @@ def read_folder(
         declared["notes"]["cameras"] = _cameras(masks, followed)
     scene, found = checked(scene_from_parts(declared, arrays))
     return scene, warnings + found, followed
+
+
+def in_stage(stage: str, told: Told) -> Told:
+    """What tells of a stage whose own messages go behind its name."""
+    return lambda done, total, message: told(done, total, f"{stage}, {message}")
 
 
 def _as_its_kind(followed: Followed, options: ImportOptions, config: TrackConfig) -> Followed:

@@ -18,7 +18,10 @@ from physworld_services.api.errors import ApiProblem, answer
 JSON_LIMIT_BYTES = 1024 * 1024
 MULTIPART_OVERHEAD_BYTES = 64 * 1024
 UPLOAD_PATHS = frozenset(
-    {"/v1/scenes", "/v1/scenes/preview", "/dashboard/scenes", "/dashboard/scenes/preview"}
+    f"/{part}/{form}{preview}"
+    for part in ("v1", "dashboard")
+    for form in ("scenes", "trackings")
+    for preview in ("", "/preview")
 )
 """Of the API, and of the dashboard, whose forms bring the same files."""
 PICTURE_PATH = re.compile(r"/(v1|dashboard)/scenes/[^/]+/pictures/[^/]+")

@@ -9,15 +9,15 @@ environment.
 
 A request is ``{"folder", "filename", "name", "options", "look"}``: the upload lies in the folder as ``upload``; the
 child leaves ``scene.zip``, the canonical archive, and ``found.json`` beside it; with ``look`` what an import would
-guess alone. An answer is ``{"outcome", "cpu_s", "peak_bytes"}``.
+guess alone, with ``pictures`` what cameras show first. An answer is ``{"outcome", "cpu_s", "peak_bytes"}``.
 """
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
 import os
-import resource
 import signal
 import sys
 import tempfile
@@ -29,44 +29,34 @@ import trimesh  # noqa: F401
 
 from physworld_scenes.bundle import checked, write_archive
 from physworld_scenes.errors import SceneInvalid
+from physworld_scenes.facts import facts_of
 from physworld_scenes.importers import ImportOptions, import_any, look_at
 from physworld_scenes.importers.library import limit_here
+from physworld_scenes.importers.unpacked import first_pictures, media_type_of, unpacked
+from physworld_scenes.limited import (
+    FAULT_CHARACTERS,
+    MEBIBYTE,
+    MOST_FAULTS,
+    Limits,
+    die_with_parent,
+    stopped_by,
+    told,
+)
 from physworld_schemas.base import FieldError
 
 UPLOAD, ARCHIVE, FOUND = "upload", "scene.zip", "found.json"
-MEBIBYTE = 1 << 20
 CPU_S, BYTES_A_CPU_S = 4, 16 * MEBIBYTE
 WALL_S, WALL_A_CPU_S = 30, 4
 MEMORY_BYTES, MEMORY_A_BYTE = 256 * MEBIBYTE, 8
 OUTPUT_BYTES = 1152 * MEBIBYTE
-MOST_FAULTS, FAULT_CHARACTERS = 50, 2000
-PR_SET_PDEATHSIG = 1
+SHOWN_BYTES = 32 * MEBIBYTE
 REFUSED, TOO_LARGE = 2, 3  # exit statuses of a child: faults are in found.json; memory or output ran out
 
 
-@dataclasses.dataclass(frozen=True)
-class Limits:
-    """What reading an upload of some bytes may take."""
-
-    cpu_s: int
-    wall_s: int
-    memory_bytes: int
-    output_bytes: int = OUTPUT_BYTES
-
-    @classmethod
-    def of(cls, size: int) -> Limits:
-        """The limits of an upload of ``size`` bytes."""
-        cpu_s = CPU_S + size // BYTES_A_CPU_S
-        return cls(cpu_s, WALL_S + WALL_A_CPU_S * cpu_s, MEMORY_BYTES + MEMORY_A_BYTE * size)
-
-    def impose(self) -> None:
-        """Let the kernel end this process where it goes beyond them."""
-        resource.setrlimit(resource.RLIMIT_CPU, (self.cpu_s, self.cpu_s + 1))
-        resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + self.memory_bytes,) * 2)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (self.output_bytes,) * 2)
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_REAL, self.wall_s)
+def limits_of(size: int) -> Limits:
+    """What reading an upload of ``size`` bytes may take."""
+    cpu_s = CPU_S + size // BYTES_A_CPU_S
+    return Limits(cpu_s, WALL_S + WALL_A_CPU_S * cpu_s, MEMORY_BYTES + MEMORY_A_BYTE * size, OUTPUT_BYTES)
 
 
 def main() -> int:
@@ -91,9 +81,7 @@ def _outcome(status: int) -> str:
     """What became of a child: ``read``, ``refused``, or the limit that stopped it."""
     code = os.waitstatus_to_exitcode(status)
     if code < 0:
-        return {-signal.SIGXCPU: "cpu", -signal.SIGKILL: "killed", -signal.SIGALRM: "wall"}.get(
-            code, "crashed"
-        )
+        return stopped_by(code)
     return {0: "read", REFUSED: "refused", TOO_LARGE: "memory"}.get(code, "crashed")
 
 
@@ -101,11 +89,14 @@ def _read(request: dict[str, Any]) -> int:
     """In the child: read, check, write; the exit status."""
     folder = Path(request["folder"])
     try:
-        _die_with_parent()
+        die_with_parent()
         os.close(0)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # answers are the parent's
-        Limits.of((folder / UPLOAD).stat().st_size).impose()
+        limits_of((folder / UPLOAD).stat().st_size).impose()
         tempfile.tempdir = str(folder)  # what a killed child leaves goes with the upload
+        if request.get("pictures"):
+            (folder / FOUND).write_text(json.dumps(_pictured(folder, request["filename"])))
+            return 0
         data = (folder / UPLOAD).read_bytes()
         options = ImportOptions(**request["options"])
         limit_here()
@@ -117,22 +108,7 @@ def _read(request: dict[str, Any]) -> int:
             scene, warnings = checked(dataclasses.replace(scene, name=request["name"]))
         with (folder / ARCHIVE).open("w+b") as stream:
             write_archive(scene, stream)
-        found = {
-            "name": scene.name,
-            "kind": scene.kind,
-            "description": scene.description,
-            "frames": scene.frame_count,
-            "points": scene.points.shape[1],
-            "controllers": scene.controllers.shape[1],
-            "fps": scene.fps,
-            "duration_s": float(scene.times[-1] - scene.times[0]),
-            "noise_sigma_m": scene.noise_sigma_m,
-            "train": scene.train,
-            "test": scene.test,
-            "declared": scene.declared,
-            "warnings": [warning[:FAULT_CHARACTERS] for warning in warnings[:MOST_FAULTS]],
-        }
-        (folder / FOUND).write_text(json.dumps(found))
+        (folder / FOUND).write_text(json.dumps(facts_of(scene, warnings)))
         return 0
     except SceneInvalid as error:
         return _refuse(folder, error.faults)
@@ -151,29 +127,23 @@ def _looked(data: bytes, filename: str, options: ImportOptions) -> dict[str, Any
     }
 
 
+def _pictured(folder: Path, filename: str) -> dict[str, Any]:
+    """What each camera of an archive of pictures shows first, as far as it is small enough to be shown."""
+    place, shown, left = folder / "pictures", [], SHOWN_BYTES
+    place.mkdir()
+    form, cameras = first_pictures(unpacked(folder / UPLOAD, filename, place))
+    for number, (name, frames, picture) in enumerate(cameras):
+        camera: dict[str, Any] = {"camera": number, "name": name, "frames": frames}
+        if picture and len(picture) <= left:
+            left -= len(picture)
+            camera |= {"media_type": media_type_of(picture), "data": base64.b64encode(picture).decode()}
+        shown.append(camera)
+    return {"form": form, "cameras": shown}
+
+
 def _refuse(folder: Path, faults: list[FieldError]) -> int:
-    told = [
-        {"loc": [part if isinstance(part, int) else part[:200] for part in fault.loc[:20]],
-         "msg": fault.msg[:FAULT_CHARACTERS]}
-        for fault in faults[:MOST_FAULTS]
-    ]  # fmt: skip
-    (folder / FOUND).write_text(json.dumps({"faults": told, "count": len(faults)}))
+    (folder / FOUND).write_text(json.dumps({"faults": told(faults), "count": len(faults)}))
     return REFUSED
-
-
-def _data_bytes() -> int:
-    """Private memory of this process now, as RLIMIT_DATA counts it."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmData:"):
-            return int(line.split()[1]) * 1024
-    return 0
-
-
-def _die_with_parent() -> None:
-    if sys.platform == "linux":
-        import ctypes
-
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ that goes beyond its limits, or crashes its reader, is a refusal like any other,
 from __future__ import annotations
 
 import json
-import os
 import queue
 import subprocess
 import sys
@@ -22,12 +21,11 @@ from typing import Any
 import structlog
 
 from physworld_scenes.errors import SceneInvalid
+from physworld_scenes.limited import environment
 from physworld_schemas.base import FieldError
 from physworld_services.api.errors import ApiProblem
 
 ROOT = Path(__file__).parents[2]
-PASSED_ON = ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL", "PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH")
-"""Of the environment: a reader of hostile files has no use for addresses and keys."""
 STOPPED = {
     "cpu": "reading it takes more processor time than a file of its size may",
     "killed": "reading it takes more processor time or memory than a file of its size may",
@@ -81,12 +79,20 @@ class Parsers:
             {"folder": str(folder), "filename": filename, "name": None, "options": options, "look": True},
         )
 
+    def pictures(self, folder: Path, filename: str) -> dict[str, Any]:
+        """What the archive or film ``upload`` in ``folder`` shows first: a ``TrackingPreview``'s fields.
+
+        Raises:
+            SceneInvalid, ApiProblem: as of ``parse``.
+        """
+        request: dict[str, Any] = {"folder": str(folder), "filename": filename, "name": None, "options": {}}
+        return self._asked(folder, request | {"pictures": True})
+
     def _asked(self, folder: Path, request: dict[str, Any]) -> dict[str, Any]:
         """What the reader found. Raises SceneInvalid."""
-        filename = request["filename"]
+        filename, size = request["filename"], (folder / "upload").stat().st_size
         with self._one() as parser:
             answer = parser.ask(request)
-        size = (folder / "upload").stat().st_size
         log.info("upload_read", bytes=size, **answer)
         outcome = answer["outcome"]
         if outcome in STOPPED:
@@ -156,8 +162,7 @@ class _Parser:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "physworld_services.api.parser_process"],
                 cwd=ROOT,
-                env={name: os.environ[name] for name in PASSED_ON if name in os.environ}
-                | {"OMP_NUM_THREADS": "1"},
+                env=environment(),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 text=True,

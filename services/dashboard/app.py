@@ -35,6 +35,7 @@ from physworld_services.dashboard import (
     pages_sessions,
     pages_start,
     pages_traces,
+    pages_trackings,
     pages_uploads,
     pages_videos,
 )
@@ -119,7 +120,8 @@ def create_dashboard(site: Site, gate: Gate, parsers: Parsers) -> FastAPI:
     viewing = [Depends(access.require_viewer)]
     for module in pages:
         app.include_router(module.router(site), dependencies=viewing)
-    app.include_router(pages_uploads.router(site, parsers), dependencies=viewing)
+    for taking in (pages_uploads, pages_trackings):
+        app.include_router(taking.router(site, parsers), dependencies=viewing)
     app.mount("/static", GZipMiddleware(StaticFiles(directory=STATIC), minimum_size=1024))
     app.add_middleware(SecurityHeaders)
     _install_errors(app, site)

@@ -128,7 +128,7 @@ def _job(site: Site, job_id: str) -> dict[str, Any]:
         family = {item.id: item for item in (job, *children)}
         latest = overview.latest_events(session, list(family), EVENTS_SHOWN)
         subject = overview.subjects_of(session, [job]).get(job_id, "")
-        inputs = [_link(session, reference) for reference in job.inputs]
+        inputs = [_link(session, one) for one in job.inputs if one.kind != "artifact"]
         parent = None if job.parent_id is None else jobs.get_job(session, job.parent_id)
         turn = loops.get_loop(session, job_id) if job.kind == "loop" else None
         told = [events.figures_of(session, item.id) for item in family.values() if item.kind == "training"]

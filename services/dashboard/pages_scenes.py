@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 PAGE_SIZE = 50
 RELATED_SHOWN = 10
 PREDICTION = "prediction.npz"
+FOLLOWED = "followed.png"
+"""Of a scene that was made of pictures here: what was followed in them."""
 DECLARED_SHOWN = ("gravity_m_s2", "initial_state", "body", "ground", "grips", "notes")
 
 FitId = Annotated[str | None, Query(max_length=64)]
@@ -101,6 +103,15 @@ def router(site: Site) -> APIRouter:
             graph=lineage_graph(site, scene_id, fit or scene_id),
             check=next((item for item in checked if item.report is not None), None),
         )
+
+    @routes.get("/scenes/{scene_id}/followed.png")
+    def followed(scene_id: str) -> Response:
+        with site.database.reading() as session:
+            record = resources.get_scene(session, scene_id)
+        picture = next((item for item in record.artifacts if item.name == FOLLOWED), None)
+        if picture is None:
+            raise NotFound("picture of scene", scene_id)
+        return Response(site.artifacts.read_bytes(picture.sha256), media_type="image/png")
 
     @routes.get("/scenes/{scene_id}/cloud")
     def cloud(scene_id: str, fit: FitId = None) -> Response:

@@ -18,7 +18,7 @@ from starlette.exceptions import HTTPException
 
 from physworld_scenes.errors import SceneInvalid
 from physworld_schemas.base import FieldError
-from physworld_schemas.scene import Scene
+from physworld_schemas.scene import Scene, SceneImport
 from physworld_schemas.video import PictureName
 from physworld_services.api.errors import ApiProblem
 from physworld_services.api.parsing import Found, Parsers
@@ -41,7 +41,7 @@ def router(site: Site, parsers: Parsers) -> APIRouter:
         try:
             form = await read_form(request)
             try:
-                given = upload_of(form, site.settings.max_upload_bytes)
+                given = upload_of(form, site.settings.max_upload_bytes, SceneImport)
                 scene = await run_in_threadpool(_uploaded, site, given, parsers)
             finally:
                 await form.close()
@@ -56,15 +56,15 @@ def router(site: Site, parsers: Parsers) -> APIRouter:
         try:
             form = await read_form(request)
             try:
-                given = upload_of(form, site.settings.max_upload_bytes)
+                given = upload_of(form, site.settings.max_upload_bytes, SceneImport)
                 found = await run_in_threadpool(looked_at, given, parsers)
             finally:
                 await form.close()
         except SceneInvalid as error:
             told = "The recording needs another word from you"
-            return JSONResponse({"told": told, "faults": _lines(error.faults)}, 422)
+            return JSONResponse({"told": told, "faults": fault_lines(error.faults)}, 422)
         except ApiProblem as problem:
-            lines = _lines(problem.errors)
+            lines = fault_lines(problem.errors)
             return JSONResponse({"told": str(problem.detail), "faults": lines}, problem.status_code)
         return JSONResponse(found.model_dump())
 
@@ -86,7 +86,7 @@ def router(site: Site, parsers: Parsers) -> APIRouter:
                 await form.close()
         except ApiProblem as problem:
             faults = [fault for fault in problem.errors if fault.msg != problem.detail]
-            told = "; ".join([str(problem.detail), *_lines(faults)])
+            told = "; ".join([str(problem.detail), *fault_lines(faults)])
             raise HTTPException(problem.status_code, f"{told}.") from problem
         return RedirectResponse(f"{BASE}/scenes/{scene_id}#pictures", 303)
 
@@ -101,7 +101,7 @@ def _pictured(site: Site, scene_id: str, name: PictureName, file: UploadFile) ->
         videos.put_picture(session, scene_id, artifact)
 
 
-def _uploaded(site: Site, given: Upload, parsers: Parsers) -> Scene:
+def _uploaded(site: Site, given: Upload[SceneImport], parsers: Parsers) -> Scene:
     with parsed(given, parsers) as found:
         return _stored(site, found)
 
@@ -132,7 +132,7 @@ def _done(request: Request, scene: Scene) -> Response:
 def _refused(
     site: Site, request: Request, told: str, faults: list[FieldError], status: int
 ) -> HTMLResponse | JSONResponse:
-    lines = _lines(faults)
+    lines = fault_lines(faults)
     if _by_script(request):
         return JSONResponse({"told": told, "faults": lines}, status)
     return site.page(
@@ -140,7 +140,8 @@ def _refused(
     )
 
 
-def _lines(faults: list[FieldError]) -> list[str]:
+def fault_lines(faults: list[FieldError]) -> list[str]:
+    """Where each fault is, and what."""
     return [f"{'.'.join(str(part) for part in fault.loc)}: {fault.msg}" for fault in faults]
 
 

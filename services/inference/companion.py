@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import struct
 import sys
 from collections import deque
@@ -31,6 +30,7 @@ from starlette.concurrency import run_in_threadpool
 
 from physworld.arrays import Array
 from physworld.worldmodel.published import PublishedModel
+from physworld_scenes.limited import environment
 from physworld_services.inference.twin_process import HEAD
 
 MOST_BEHIND_S = 20.0
@@ -39,8 +39,6 @@ PACE_TICKS = 30
 AT_REST = 2e-5
 """Of the body's size: a body whose vertices move less within a tick, under grips that stay, lies still."""
 ROOT = Path(__file__).parents[2]
-PASSED_ON = ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL", "PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH")
-"""Of the environment: the twin's process has no use for addresses and keys."""
 
 log = structlog.get_logger("physworld.live")
 
@@ -185,13 +183,12 @@ class Companion:
 
 
 async def _started() -> asyncio.subprocess.Process:
-    environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
     return await asyncio.create_subprocess_exec(
         sys.executable,
         "-m",
         "physworld_services.inference.twin_process",
         cwd=ROOT,
-        env=environment | {"OMP_NUM_THREADS": "1"},
+        env=environment(),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.DEVNULL,

@@ -24,6 +24,7 @@ from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TraceCreate
+from physworld_schemas.tracking import TrackingOptions
 from physworld_schemas.video import VideoCreate
 from physworld_storage.changes import announce
 from physworld_storage.errors import Conflict, NotFound
@@ -41,6 +42,7 @@ from physworld_storage.jobs.kinds import (
     plan,
     rollout,
     trace,
+    tracking,
     training,
     video,
 )
@@ -50,6 +52,11 @@ from physworld_storage.runs import RunKind
 from physworld_storage.tables import JobRow, ShardRow, columns_of, utc_now
 
 RUNS: dict[RunKind, rollout.RunJobs] = {"rollout": rollout.KIND, "plan": plan.KIND}
+
+
+def create_tracking(session: Session, upload: Artifact, options: TrackingOptions) -> Job:
+    """Open a tracking of stored pictures; the scene that it makes is in ``outputs`` once it is there."""
+    return _job(session, tracking.KIND.open(session, upload, options))
 
 
 def create_fit(

@@ -71,6 +71,7 @@ def pages(world: World) -> list[str]:
         "/keys",
         "/keys/audit",
         "/sessions",
+        "/trackings",
         *(f"/start/{kind}" for kind in starts),
     ]
 

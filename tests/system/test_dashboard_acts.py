@@ -5,19 +5,24 @@ The server is real, the uploads are read by the process that reads them in produ
 
 from __future__ import annotations
 
+import io
 import re
+import zipfile
 from pathlib import Path
 
 import marker_files
 import pytest
+import tracking_pictured
 from dashboard_browser import Visit
 from dashboard_world import World, add_scene, chain_recording
 from playwright.sync_api import expect
+from test_dashboard_accessible import violations
 
 from physworld.scene import Scene
 from physworld_storage import registry, resources
 from physworld_storage.errors import NotFound
 from physworld_storage.jobs import jobs
+from physworld_storage.tables import ShardRow
 
 pytestmark = pytest.mark.browser
 SAMPLE = Path(__file__).parents[2] / "sample" / "soft_beam"
@@ -225,3 +230,83 @@ def test_a_page_that_does_not_exist_has_the_navigation(visit: Visit) -> None:
     visit.page.locator(".top nav").get_by_role("link", name="Models").click()
     expect(visit.page.locator("h1")).to_have_text("Models")
     visit.errors.clear()  # Chromium notes the 404 itself
+
+
+def test_pictures_are_looked_at_a_box_is_drawn_and_a_job_follows_the_object(
+    visit: Visit, world: World, tmp_path: Path
+) -> None:
+    folder, archive = tmp_path / "plate", tmp_path / "plate.zip"
+    tracking_pictured.write(folder)
+    with zipfile.ZipFile(archive, "w") as packed:
+        for path in sorted(folder.rglob("*.*")):
+            packed.write(path, path.relative_to(tmp_path).as_posix())
+    (tmp_path / "robot.csv").write_text("t,x,y,z\n0,0,0,0\n1,0,0,0.1\n")
+    visit.open("/scenes")
+    visit.page.get_by_role("link", name="Make a scene of them").click()
+    visit.page.set_input_files("#pictures", archive)
+    visit.page.get_by_role("button", name="Look").click()
+    expect(visit.page.locator("[data-told]")).to_contain_text("plate.zip: 1 camera, 12 pictures each")
+    canvas = visit.page.get_by_role("img", name="First picture of the camera, with the boxes")
+    expect(canvas).to_have_attribute("width", "160")
+    for scheme, width in (("dark", 360), ("light", 1280)):
+        visit.page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+        visit.page.set_viewport_size({"width": width, "height": 900})
+        assert violations(visit) == []
+        assert visit.page.evaluate("document.documentElement.scrollWidth") <= width
+    canvas.scroll_into_view_if_needed()
+    area = canvas.bounding_box()
+    assert area is not None
+    scale = area["width"] / tracking_pictured.WIDTH
+    mouse = visit.page.mouse
+
+    def at(column: int, row: int) -> tuple[float, float]:
+        return area["x"] + column * scale, area["y"] + row * scale
+
+    mouse.move(*at(42, 32))
+    mouse.down()
+    mouse.move(*at(118, 88), steps=4)
+    mouse.up()
+    box = [int(one.input_value()) for one in visit.page.locator("[data-box=object] [data-corner]").all()]
+    assert all(abs(mine - meant) <= 1 for mine, meant in zip(box, (42, 32, 118, 88), strict=True)), box
+    visit.page.get_by_role("radio", name="draw or click it by mouse").check()
+    canvas.click(position={"x": 60 * scale, "y": 60 * scale})
+    expect(visit.page.get_by_label("What moves the object")).to_have_value("patch")
+    held = visit.page.get_by_role("group", name="Box of what is held")
+    for corner, value in zip(("Left", "Top", "Right", "Bottom"), (50, 40, 65, 80), strict=True):
+        held.get_by_label(corner).fill(str(value))  # as somebody does who has no mouse
+    visit.page.locator("select[data-option=kind]").select_option("sheet")
+    visit.page.get_by_label("Mass [kg]").fill("0.05")
+    visit.page.get_by_role("button", name="Make the scene").click()
+    visit.page.wait_for_url(re.compile(r"/jobs/job_"))
+    expect(visit.page.locator("h1")).to_contain_text("Tracking of plate.zip")
+    with world.database.session() as session:
+        job = jobs.get_job(session, visit.page.url.rpartition("/")[2])
+        jobs.cancel_job(session, job.id)
+    assert job.config["boxes"] == {"0": box} and job.config["body"] == {"mass_kg": 0.05}
+    patch = job.config["gripper"]["patch"]
+    assert [patch[2] - patch[0], patch[3] - patch[1]] == [40, 40] and abs(patch[0] - 40) <= 1
+    assert job.config["gripper"]["held_px"] == [50, 40, 65, 80]
+
+    visit.open("/trackings")
+    visit.page.set_input_files("#folder", folder)
+    visit.page.get_by_role("button", name="Look").click()
+    expect(visit.page.locator("[data-told]")).to_contain_text("plate.zip: 1 camera")
+    for corner, value in zip(("Left", "Top", "Right", "Bottom"), (42, 32, 118, 88), strict=True):
+        visit.page.get_by_role("group", name="Box of the object").get_by_label(corner).fill(str(value))
+    visit.page.get_by_label("What moves the object").select_option("log")
+    visit.page.set_input_files("[data-log]", tmp_path / "robot.csv")
+    visit.page.get_by_role("button", name="Make the scene").click()
+    visit.page.wait_for_url(re.compile(r"/jobs/job_"))
+    with world.database.session() as session:
+        job = jobs.get_job(session, visit.page.url.rpartition("/")[2])
+        (shard,) = session.query(ShardRow).where(ShardRow.job_id == job.id).all()
+        jobs.cancel_job(session, job.id)
+    data = world.stores.artifacts.read_bytes(job.inputs[0].digest or "")
+    with zipfile.ZipFile(io.BytesIO(data)) as sent:
+        assert {"robot.csv", "color/0.png", "depth/11.png", "camera_intrinsic.json"} <= set(sent.namelist())
+    assert job.config["gripper"] == {"log": "robot.csv"} and shard.kind == "tracking"
+    visit.open("/trackings")
+    visit.page.set_input_files("#pictures", tmp_path / "robot.csv")
+    visit.page.get_by_role("button", name="Look").click()
+    expect(visit.page.locator("[data-told] li").first).to_contain_text("neither a zip nor a tar")
+    visit.errors.clear()  # Chromium notes the 422 itself

@@ -17,8 +17,6 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from physworld_workers.commands import importing_planar as planar
 from physworld_workers.commands.importing_planar import numbers
 
@@ -340,29 +338,12 @@ def _say(scene: Scene, warnings: list[str], out: Path) -> None:
 
 
 def _draw(given: argparse.Namespace, followed: Followed) -> None:
-    """First and last picture of every camera with mask and points: green seen, red not."""
-    from PIL import Image, ImageDraw
+    from PIL import Image
 
-    rows = []
-    for number, (view, mask) in enumerate(zip(followed.views, followed.masks, strict=True)):
-        pictures = []
-        for frame in (0, view.frames - 1):
-            colour = view.colour(frame).copy()
-            if frame == 0 and mask.size:
-                colour[mask] = colour[mask] // 2 + np.array([0, 60, 110], dtype=np.uint8)
-            picture = Image.fromarray(colour)
-            pen = ImageDraw.Draw(picture)
-            for point in np.flatnonzero(followed.cameras == number):
-                x, y = followed.pixels[frame, point]
-                if np.isfinite([x, y]).all():
-                    seen = followed.visible[frame, point]
-                    pen.ellipse((x - 2, y - 2, x + 2, y + 2), fill="lime" if seen else "red")
-            pictures.append(np.asarray(picture))
-        rows.append(np.hstack(pictures))
-    widest = max(row.shape[1] for row in rows)
-    rows = [np.pad(row, ((0, 0), (0, widest - row.shape[1]), (0, 0))) for row in rows]
+    from physworld_workers.followed_pictures import first_and_last
+
     given.picture.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.vstack(rows)).save(given.picture)
+    Image.fromarray(first_and_last(followed)).save(given.picture)
     print(f"{given.picture}: the first frame of every camera with the object's pixels, and the last")
 
 
@@ -370,6 +351,7 @@ def _keep_pictures(folder: Path, followed: Followed) -> None:
     """What ``physworld scenes picture`` takes: splat of the first frame, first camera, and its pictures."""
     from physworld.video import SplatConfig, SplatView
     from physworld_workers.commands.splat import fitted_splat
+    from physworld_workers.followed_pictures import write_camera, write_frames
 
     shown = [
         SplatView(view.camera, view.colour(0), mask, view.depth(0))
@@ -378,11 +360,8 @@ def _keep_pictures(folder: Path, followed: Followed) -> None:
     ]
     fitted_splat(shown, None, SplatConfig(), folder / "splat.ply")
     view = followed.views[0]
-    numbers = {name: getattr(view.camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    facts = {**numbers, "world_to_camera": view.camera.world_to_camera.tolist()}
-    (folder / "camera.json").write_text(json.dumps(facts, indent=1) + "\n")
-    frames = np.stack([view.colour(frame) for frame in range(view.frames)])
-    np.savez_compressed(folder / "frames.npz", frames=frames)
+    write_camera(view, folder / "camera.json")
+    write_frames(view, folder / "frames.npz")
     print(f"{folder}: splat.ply, camera.json, frames.npz of camera 0 ({view.frames} frames)")
 
 

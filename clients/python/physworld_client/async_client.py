@@ -22,6 +22,7 @@ from physworld_client.async_resources import (
     AsyncModels,
     AsyncPipelines,
     AsyncScenes,
+    AsyncTrackings,
 )
 from physworld_client.async_videos import AsyncVideos
 from physworld_client.calls import Call
@@ -48,8 +49,8 @@ class AsyncClient:
             terminal.
 
     Attributes:
-        scenes, checks, fits, traces, datasets, models, assessments, loops, rollouts, plans, videos, live, jobs, keys,
-        pipelines, artifacts:
+        scenes, trackings, checks, fits, traces, datasets, models, assessments, loops, rollouts, plans, videos, live,
+        jobs, keys, pipelines, artifacts:
             the resources.
     """
 
@@ -75,6 +76,7 @@ class AsyncClient:
         )
         self.known_as = known_as or found.known_as or wire.service_name(self.base_url)
         self.scenes = AsyncScenes(self)
+        self.trackings = AsyncTrackings(self)
         self.fits = AsyncFits(self)
         self.checks = AsyncChecks(self)
         self.traces = AsyncTraces(self)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 
 import httpx
@@ -12,7 +12,7 @@ import httpx
 from physworld_client import calls, transport
 from physworld_client.arrays import arrays_of
 from physworld_client.async_base import AsyncListed, AsyncResource
-from physworld_client.bundle import open_bundle
+from physworld_client.bundle import open_bundle, open_pictures
 from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.export import open_export
 from physworld_client.known_keys import is_fingerprint, trusted_keys
@@ -41,6 +41,7 @@ from physworld_schemas.job import TERMINAL_STATES
 from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.scene import SceneImport
+from physworld_schemas.tracking import TrackingOptions, TrackingPreview
 
 LATEST = "latest"
 
@@ -92,6 +93,31 @@ class AsyncScenes(AsyncListed):
         return await self._page(
             lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind, tag=tag), cursor
         )
+
+
+class AsyncTrackings(AsyncResource):
+    """Pictures of an object in motion, of which a job makes a scene."""
+
+    async def create(
+        self,
+        path: str | Path,
+        options: TrackingOptions | None = None,
+        files: Mapping[str, Path] | None = None,
+    ) -> Job:
+        """Uploads pictures; the job's output is the scene.
+
+        Args:
+            path: folder of pictures (packed to a zip), archive of one, or film.
+            options: where the object is, what moves it, what is known of it.
+            files: further files by the names that the options give them: masks, tracks, a robot's log, a camera.
+        """
+        with open_pictures(path, files) as upload, self._client.bars.sending(upload) as sent:
+            return await self._client.send(calls.tracking_create(sent, options))
+
+    async def preview(self, path: str | Path) -> TrackingPreview:
+        """The first picture of each camera, in whose pixels the options speak. Nothing is stored."""
+        with open_pictures(path) as upload, self._client.bars.sending(upload) as sent:
+            return await self._client.send(calls.tracking_preview(sent))
 
 
 class AsyncFits(AsyncListed):

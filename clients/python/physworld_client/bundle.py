@@ -7,8 +7,10 @@ it is; the service tells by its content what it is and checks it. Nothing is unp
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +21,10 @@ from physworld_schemas.wording import pictures_among
 
 BUNDLE_FILES = ("scene.json", "scene.npz")
 MESH_SUFFIXES = (".obj", ".off", ".ply", ".stl")
+FILMS = (".mp4", ".mkv", ".avi")
+COMPRESSED = (".png", ".jpg", ".jpeg", ".npz", *FILMS)
+PICTURED = (*COMPRESSED, ".npy", ".json", ".pkl", ".csv")
+"""What belongs to a folder of pictures: those, their depth, tracks, cameras and logs."""
 SPOOL_LIMIT_BYTES = 64 * 2**20
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 MEDIA_TYPES = {".zip": "application/zip", ".gz": "application/gzip", ".tgz": "application/gzip"}
@@ -51,6 +57,53 @@ def open_bundle(path: str | Path) -> Upload:
     if source.is_dir():
         return _pack_folder(source)
     return open_file(source)
+
+
+def open_pictures(path: str | Path, files: Mapping[str, Path] | None = None) -> Upload:
+    """Pictures of an object, ready to be sent: a folder becomes a zip, an archive or a film is sent as it is.
+
+    Args:
+        path: folder of pictures, archive of one, or film.
+        files: by their names in the archive further ones, beside a folder or a film: masks, tracks, a log, a camera.
+
+    Raises:
+        BundleUnreadable: nothing is there, nothing is in it, or an archive is to take further files.
+    """
+    source = Path(path).expanduser()
+    more = dict(files or {})
+    if source.is_dir():
+        entries = [(entry.relative_to(source).as_posix(), entry) for entry in sorted(source.rglob("*"))]
+        held = {
+            name: entry for name, entry in entries if entry.suffix.lower() in PICTURED and entry.is_file()
+        }
+        if not held:
+            raise BundleUnreadable(f"{source} holds no pictures and no film")
+        return _pack(source.resolve().name, held | more)
+    if not more:
+        return open_file(source)
+    if source.suffix.lower() not in FILMS:
+        raise BundleUnreadable(
+            f"{source} is no folder and no film: {', '.join(more)} cannot be put beside it"
+        )
+    return _pack(source.stem, {source.name: source, **more})
+
+
+def _pack(name: str, files: Mapping[str, Path]) -> Upload:
+    """Files as one zip; what is compressed already is stored as it is."""
+    stream = tempfile.SpooledTemporaryFile(max_size=SPOOL_LIMIT_BYTES)  # noqa: SIM115 (the upload closes it)
+    try:
+        with zipfile.ZipFile(stream, "w") as archive:
+            for inside, path in files.items():
+                entry = zipfile.ZipInfo(inside, ZIP_EPOCH)
+                compressed = path.suffix.lower() in COMPRESSED
+                entry.compress_type = zipfile.ZIP_STORED if compressed else zipfile.ZIP_DEFLATED
+                with path.open("rb") as source, archive.open(entry, "w", force_zip64=True) as target:
+                    shutil.copyfileobj(source, target)
+    except OSError as error:
+        stream.close()
+        raise BundleUnreadable(f"{error.filename or name} cannot be read: {error.strerror}") from error
+    stream.seek(0)
+    return Upload(stream, f"{name}.zip", "application/zip")
 
 
 def open_file(path: str | Path) -> Upload:

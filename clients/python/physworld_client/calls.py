@@ -39,8 +39,9 @@ from physworld_schemas.key import KeyCreate, KeyRotate, Role
 from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import AliasSet, TrainingConfig, TrainingCreate, VersionPatch
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_schemas.scene import SceneImport, ScenePatch
+from physworld_schemas.scene import RecordingFacts, SceneImport, ScenePatch
 from physworld_schemas.trace import TraceConfig, TraceCreate
+from physworld_schemas.tracking import TrackingOptions, TrackingPreview
 
 Answer = TypeVar("Answer")
 Item = TypeVar("Item")
@@ -70,6 +71,7 @@ ListCall = Callable[[str | None], Call[Page[Item]]]
 
 _SCENE = TypeAdapter(Scene)
 _PREVIEW = TypeAdapter(ScenePreview)
+_FIRST = TypeAdapter(TrackingPreview)
 _KEY = TypeAdapter(ApiKey)
 _KEYS = TypeAdapter(Page[ApiKey])
 _FIT = TypeAdapter(Fit)
@@ -118,8 +120,18 @@ def scene_preview(upload: Upload, options: SceneImport | None) -> Call[ScenePrev
     return Call("POST", "/v1/scenes/preview", _PREVIEW, upload=upload, form=_options(options))
 
 
-def _options(options: SceneImport | None) -> Mapping[str, str]:
+def _options(options: RecordingFacts | None) -> Mapping[str, str]:
     return {} if options is None else {"options": options.model_dump_json(exclude_unset=True)}
+
+
+def tracking_create(upload: Upload, options: TrackingOptions | None) -> Call[Job]:
+    """POST /v1/trackings, multipart fields ``bundle`` and ``options``."""
+    return Call("POST", "/v1/trackings", _JOB, upload=upload, form=_options(options))
+
+
+def tracking_preview(upload: Upload) -> Call[TrackingPreview]:
+    """POST /v1/trackings/preview, multipart field ``bundle``."""
+    return Call("POST", "/v1/trackings/preview", _FIRST, upload=upload)
 
 
 def scene_get(scene_id: str) -> Call[Scene]:

@@ -27,6 +27,7 @@ from physworld_client.resources import (
     Models,
     Pipelines,
     Scenes,
+    Trackings,
 )
 from physworld_client.videos import Videos
 
@@ -49,8 +50,8 @@ class Client:
             terminal.
 
     Attributes:
-        scenes, checks, fits, traces, datasets, models, assessments, loops, rollouts, plans, videos, live, jobs, keys,
-        pipelines, artifacts:
+        scenes, trackings, checks, fits, traces, datasets, models, assessments, loops, rollouts, plans, videos, live,
+        jobs, keys, pipelines, artifacts:
             the resources.
     """
 
@@ -74,6 +75,7 @@ class Client:
         self.http = httpx.Client(transport=transport, **wire.client_options(found.url, found.token, timeout))
         self.known_as = known_as or found.known_as or wire.service_name(self.base_url)
         self.scenes = Scenes(self)
+        self.trackings = Trackings(self)
         self.fits = Fits(self)
         self.checks = Checks(self)
         self.traces = Traces(self)

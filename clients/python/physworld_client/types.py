@@ -61,6 +61,7 @@ from physworld_schemas.plan import PlanConfig, PlanLimits, PointGoal, ShapeGoal
 from physworld_schemas.rollout import Part, Start
 from physworld_schemas.scene import ImportGuess, SceneImport
 from physworld_schemas.trace import Figure, FoundEffect, TraceConfig
+from physworld_schemas.tracking import FilmPlane, FirstPicture, Gripper, TrackingOptions, TrackingPreview
 from physworld_schemas.video import CameraView, VideoConfig, VideoReport, VideoScores
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -93,9 +94,12 @@ __all__ = [
     "Event",
     "FieldError",
     "Figure",
+    "FilmPlane",
+    "FirstPicture",
     "Fit",
     "FitConfig",
     "FoundEffect",
+    "Gripper",
     "ImportGuess",
     "Job",
     "Lineage",
@@ -131,6 +135,8 @@ __all__ = [
     "Start",
     "Trace",
     "TraceConfig",
+    "TrackingOptions",
+    "TrackingPreview",
     "TrainingConfig",
     "VersionError",
     "Video",

@@ -39,6 +39,7 @@ from physworld_scenes.importers.rgbd import (
     UNSEEN_WARNING,
     PictureOptions,
     Told,
+    in_stage,
 )
 
 STRETCH_WARNING = 0.03
@@ -67,7 +68,7 @@ def read_planar(
         pictures: the object, its gripper, frames; ``up`` is an axis of the plane: x right and y up in the picture,
             z towards the camera.
         plane: see there.
-        told: progress: frames done, frames in all, a message.
+        told: progress of the stages of :mod:`physworld_scenes.importers.rgbd`.
 
     Raises:
         SceneInvalid: the film is damaged, or plane, object or gripper cannot be found or followed; with the numbers.
@@ -80,6 +81,7 @@ def read_planar(
     warnings: list[str] = []
     kind = options.kind or DEFAULT_KIND
     behind = behind_m(kind, options.body)
+    told(0, 1, "reading")
     filmed = read_film(path, told_plane.lens, slice(given.first, given.last))
     try:
         placed = placed_on(filmed, told_plane, given.up, warnings)
@@ -87,13 +89,16 @@ def read_planar(
         require_plausible(placed, mask, told_plane)
         factor = TRACKING_PIXEL_M / placed.pixel_m(mask)
         small = scaled(placed.view, factor)
-        followed = follow_all([small], Masks([mask], {}, []), TrackConfig(points=given.points), told)
+        config, telling = TrackConfig(points=given.points), in_stage("tracking", told)
+        followed = follow_all([small], Masks([mask], {}, []), config, telling)
         followed = _unscaled(followed, placed, factor)
         times, fps = _times(filmed, options, warnings)
+        told(0, 1, "gripping")
         gripper = None if given.grip is None else straight_grip(filmed, given.grip)
         way = None if gripper is None else gripper_way(placed, small, factor, gripper, times)
     except TrackingFailed as error:
         raise refused(path.name, str(error)) from error
+    told(0, 1, "scene")
     controllers, grips, errors = np.zeros((len(times), 0, 3)), None, np.zeros((0, len(times), 0, 3))
     if gripper is not None and way is not None:
         controllers, grips = controllers_of(placed, gripper, way, followed, behind, warnings)

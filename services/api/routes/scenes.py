@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from sqlalchemy.orm import Session
 
 from physworld_schemas.base import Page
-from physworld_schemas.scene import Scene, ScenePatch, ScenePreview
+from physworld_schemas.scene import Scene, SceneImport, ScenePatch, ScenePreview
 from physworld_services.api.dependencies import DatabaseDep, ObjectId, PageDep, SettingsDep, StoresDep
 from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import Idempotency, IdempotencyDep, answer_of
@@ -41,7 +41,7 @@ async def create_scene(
     slots = cast(anyio.CapacityLimiter, request.app.state.upload_slots)
     form = await read_form(request)
     try:
-        upload = upload_of(form, settings.max_upload_bytes)
+        upload = upload_of(form, settings.max_upload_bytes, SceneImport)
         parsers = cast(Parsers, request.app.state.parsers)
         return await anyio.to_thread.run_sync(_register, upload, parsers, stores, idempotency, limiter=slots)
     finally:
@@ -59,7 +59,7 @@ async def preview_scene(request: Request, settings: SettingsDep, idempotency: Id
     slots = cast(anyio.CapacityLimiter, request.app.state.upload_slots)
     form = await read_form(request)
     try:
-        upload = upload_of(form, settings.max_upload_bytes)
+        upload = upload_of(form, settings.max_upload_bytes, SceneImport)
         parsers = cast(Parsers, request.app.state.parsers)
         return await anyio.to_thread.run_sync(_preview, upload, parsers, idempotency, limiter=slots)
     finally:
@@ -95,12 +95,14 @@ def patch_scene(scene_id: ObjectId, body: ScenePatch, database: DatabaseDep) -> 
         return resources.patch_scene(session, scene_id, body)
 
 
-def _preview(upload: Upload, parsers: Parsers, idempotency: Idempotency) -> Response:
+def _preview(upload: Upload[SceneImport], parsers: Parsers, idempotency: Idempotency) -> Response:
     found = looked_at(upload, parsers)
     return idempotency.run(f"preview {upload.fingerprint()}", lambda session: answer_of(200, found))
 
 
-def _register(upload: Upload, parsers: Parsers, stores: Stores, idempotency: Idempotency) -> Response:
+def _register(
+    upload: Upload[SceneImport], parsers: Parsers, stores: Stores, idempotency: Idempotency
+) -> Response:
     with parsed(upload, parsers) as found:
         artifact = stores.artifacts.put_file(found.archive, ARCHIVE_NAME, "application/zip")
         facts = found.facts

@@ -10,14 +10,26 @@ contract tests ask for the refusals and for long waits themselves.
 from __future__ import annotations
 
 import atexit
+import io
 import os
 import random
+import zipfile
 from typing import Any
 from uuid import uuid4
 
 import schemathesis
 from schemathesis import Case, GenerationMode, HookContext
 from schemathesis_real import Answers, Real
+
+
+def pictures() -> bytes:
+    """A zip that begins as a folder of pictures with depth does."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name in ("color/0.png", "color/1.png", "depth/0.png", "depth/1.png"):
+            archive.writestr(name, b"\x89PNG\r\n\x1a\n")
+    return buffer.getvalue()
+
 
 TOKEN = "PHYSWORLD_TOKEN"
 """Variable of the key; without it the ids stay made up."""
@@ -29,6 +41,7 @@ WHOLE = {"/v1/rollouts": Real.rollout, "/v1/plans": Real.plan, "/v1/loops": Real
 """Bodies that have to fit a model: half of the requests take these."""
 FULL = (("/tracks", "/v1/traces", "?state=ready"), ("/episodes/", "/v1/datasets", "?state=sealed"))
 """Parts of paths that only such items of a listing have."""
+PICTURES = pictures()
 _SERVICES: dict[str, Real] = {}
 _RANDOM = random.Random(0)
 _ANSWERS = Answers()
@@ -83,6 +96,8 @@ def _body(case: Case, real: Real) -> dict[str, Any]:
         return WHOLE[case.path](real)
     if case.path in ("/v1/scenes", "/v1/scenes/preview"):
         return {"bundle": real.archive()}
+    if case.path in ("/v1/trackings", "/v1/trackings/preview"):
+        return {"bundle": PICTURES}
     if case.path.endswith("/pictures/{name}"):
         case.path_parameters["name"] = "splat.ply"
         return {"bundle": b"ply\nformat binary_little_endian 1.0\nend_header\n"}

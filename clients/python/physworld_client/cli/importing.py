@@ -1,5 +1,5 @@
 """``physworld import SOURCE --out SCENE``: a recording of any form to a scene, in this process as ``physworld
-fit`` does."""
+fit`` does; with ``--service`` a running service makes and keeps it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import Annotated
 
 import typer
 
+from physworld_client.cli import service as services
 from physworld_client.cli.fit import become
-from physworld_client.cli.options import PNG_FILE
+from physworld_client.cli.importing_there import import_there
+from physworld_client.cli.options import PNG_FILE, Data, Token, Url
 
 MODULE = "physworld_workers.commands.importing"
 
@@ -80,6 +82,15 @@ def import_recording(
     pictures: Annotated[
         Path | None, typer.Option(help="Folder for what films need: a fitted splat, camera, frames.")
     ] = None,
+    service: Annotated[
+        bool, typer.Option("--service", help="A running service makes the scene and keeps it.")
+    ] = False,
+    keep_pictures: Annotated[
+        bool, typer.Option("--keep-pictures", help="There, keep the first camera's pictures beside it.")
+    ] = False,
+    url: Url = None,
+    token: Token = None,
+    data: Data = None,
 ) -> None:
     """Make a scene of a recording; needs no service."""
     given = {
@@ -117,9 +128,14 @@ def import_recording(
         "--picture": picture,
         "--pictures": pictures,
     }
-    options = [f"{option}={value}" for option, value in given.items() if value is not None]
-    options += [f"--box={value}" for value in box or []] + [f"--mask={value}" for value in mask or []]
-    options += [f"--tracks={value}" for value in tracks or []]
-    options += [f"--body={value}" for value in body or []]
+    several = {"--box": box or [], "--mask": mask or [], "--tracks": tracks or [], "--body": body or []}
     flags = {"--undeformed": undeformed, "--look": look, "--assume": assume}
+    if service:
+        with services.connect(url, token, data) as client:
+            import_there(client, source, {**given, **flags, "--keep-pictures": keep_pictures}, several)
+        return
+    if keep_pictures or any(one is not None for one in (url, token, data)):
+        raise typer.BadParameter("--keep-pictures, --url, --token and --data need --service")
+    options = [f"{option}={value}" for option, value in given.items() if value is not None]
+    options += [f"{option}={value}" for option, values in several.items() for value in values]
     become(MODULE, [*options, *(flag for flag, given in flags.items() if given), "--", str(source)])

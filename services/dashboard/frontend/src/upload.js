@@ -3,21 +3,10 @@
 // Without this script the form posts the file as any form does.
 
 import { zip } from "fflate";
+import { ask, filesOf, post, takesDrops, tell } from "./sending.js";
 
 const TABLE = /\.(csv|tsv|txt|dat|trc|c3d|npz|h5|hdf5|mcap)$/i;
 const PACKED = /\.(json|npz|obj|off|ply|stl)$/i;
-
-/** Every file below a dropped entry as [path within the folder, File]. */
-async function filesOf(entry, path = "") {
-  if (entry.isFile) return [[path + entry.name, await new Promise((done, fail) => entry.file(done, fail))]];
-  const reader = entry.createReader();
-  const found = [];
-  for (;;) {
-    const some = await new Promise((done, fail) => reader.readEntries(done, fail));
-    if (!some.length) return found;
-    for (const inner of some) found.push(...(await filesOf(inner, `${path}${entry.name}/`)));
-  }
-}
 
 /** A folder as one zip, its own name left out of the paths; what is no part of a scene is left out. */
 async function packed(entry) {
@@ -32,19 +21,6 @@ async function packed(entry) {
   }
   const bytes = await new Promise((done, fail) => zip(tree, (error, data) => (error ? fail(error) : done(data))));
   return new File([bytes], `${entry.name}.zip`, { type: "application/zip" });
-}
-
-function tell(form, told, faults = []) {
-  const place = form.querySelector("[data-told]");
-  place.replaceChildren();
-  const line = document.createElement("p");
-  line.className = faults.length || told.endsWith(".") ? "fault" : "quiet";
-  line.textContent = told;
-  place.append(line);
-  if (!faults.length) return;
-  const list = document.createElement("ul");
-  for (const fault of faults) list.append(Object.assign(document.createElement("li"), { textContent: fault }));
-  place.append(list);
 }
 
 /** What a person said beside the file: the fields of a SceneImport that are filled. */
@@ -77,21 +53,10 @@ function show(form, found) {
 
 /** Ask what an import would guess; the options are there for what it could not, or guessed wrongly. */
 async function look(form, file) {
-  const options = form.querySelector("[data-options]");
   form.looked = file;
-  tell(form, `Looking at ${file.name} …`);
-  const body = new FormData();
-  body.append("bundle", file, file.name);
-  body.append("options", JSON.stringify(optionsOf(form)));
-  try {
-    const answer = await fetch(`${form.action}/preview`, { method: "POST", body, headers: { Accept: "application/json" } });
-    const found = await answer.json();
-    options.hidden = false;
-    if (answer.ok) show(form, found);
-    else tell(form, found.told ?? `The service answered ${answer.status}.`, found.faults);
-  } catch {
-    tell(form, "The service does not answer; nothing was stored.");
-  }
+  const found = await ask(form, file, optionsOf(form));
+  form.querySelector("[data-options]").hidden = false;
+  if (found) show(form, found);
 }
 
 function bring(form, file) {
@@ -100,36 +65,7 @@ function bring(form, file) {
 }
 
 function send(form, file) {
-  const bar = form.querySelector("progress");
-  const request = new XMLHttpRequest();
-  request.open("POST", form.action);
-  request.setRequestHeader("Accept", "application/json");
-  request.upload.addEventListener("progress", (event) => {
-    if (event.lengthComputable) bar.value = event.loaded / event.total;
-    if (event.loaded === event.total) tell(form, "Checking the recording …");
-  });
-  request.addEventListener("load", () => {
-    bar.hidden = true;
-    let answer = {};
-    try {
-      answer = JSON.parse(request.responseText);
-    } catch {
-      answer = { told: `The service answered ${request.status}.` };
-    }
-    if (answer.place) location.assign(answer.place);
-    else tell(form, answer.told ?? `The service answered ${request.status}.`, answer.faults);
-  });
-  request.addEventListener("error", () => {
-    bar.hidden = true;
-    tell(form, "The service does not answer; nothing was stored.");
-  });
-  bar.hidden = false;
-  bar.value = 0;
-  tell(form, `Uploading ${file.name} …`);
-  const body = new FormData();
-  body.append("bundle", file, file.name);
-  if (form.looked === file) body.append("options", JSON.stringify(optionsOf(form)));
-  request.send(body);
+  post(form, file, form.looked === file ? optionsOf(form) : null, "Checking the recording …");
 }
 
 for (const form of document.querySelectorAll("[data-upload]")) {
@@ -141,22 +77,8 @@ for (const form of document.querySelectorAll("[data-upload]")) {
   });
   form.querySelector("[data-look]")?.addEventListener("click", () => look(form, form.looked));
   form.querySelector("[data-store]")?.addEventListener("click", () => send(form, form.looked));
-  form.addEventListener("dragover", (event) => {
-    event.preventDefault();
-    form.classList.add("over");
-  });
-  form.addEventListener("dragleave", () => form.classList.remove("over"));
-  form.addEventListener("drop", async (event) => {
-    event.preventDefault();
-    form.classList.remove("over");
-    const item = event.dataTransfer.items[0];
-    const entry = item?.webkitGetAsEntry?.();
-    const file = event.dataTransfer.files[0];
-    try {
-      if (entry?.isDirectory) send(form, await packed(entry));
-      else if (file) bring(form, file);
-    } catch (error) {
-      tell(form, error.message);
-    }
+  takesDrops(form, async (entry, file) => {
+    if (entry?.isDirectory) send(form, await packed(entry));
+    else if (file) bring(form, file);
   });
 }

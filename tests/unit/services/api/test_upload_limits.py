@@ -31,10 +31,11 @@ def post(path: str, content: bytes) -> httpx.Response:
     return asyncio.run(sent())
 
 
-@pytest.mark.parametrize(
-    "path", ["/v1/scenes", "/v1/scenes/preview", f"{BASE}/scenes", f"{BASE}/scenes/preview"]
-)
-def test_a_table_of_two_mebibytes_comes_in(path: str) -> None:
+@pytest.mark.parametrize("preview", ["", "/preview"])
+@pytest.mark.parametrize("form", ["scenes", "trackings"])
+@pytest.mark.parametrize("part", ["/v1", BASE])
+def test_a_recording_of_two_mebibytes_comes_in(part: str, form: str, preview: str) -> None:
+    path = f"{part}/{form}{preview}"
     assert path in UPLOAD_PATHS
     assert post(path, TWO_MEBIBYTES_OF_COMMAS).json() == {"bytes": 2 << 20}
     assert post(path, b"\0" * (LIMIT + (1 << 20))).status_code == 413

@@ -31,6 +31,7 @@ PARTS = (
     "/ghost",
     "/splat",
     "/export/",
+    "/followed.png",
 )
 ELSEWHERE = {"/fits/*", "/checks/*", "/videos/*", "/videos/*/*"}  # films, or lead to what they belong to
 MOST_BYTES = 6_000_000
