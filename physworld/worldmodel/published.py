@@ -44,7 +44,7 @@ from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.properties import PhiColumn, columns_of, with_named
 from physworld.worldmodel.model.skinning import Skin
 from physworld.worldmodel.native.engine import RolloutEngine
-from physworld.worldmodel.priors.chain import ChainPrior
+from physworld.worldmodel.priors.chain import ChainPrior, straight
 from physworld.worldmodel.priors.modal import ModalPrior
 from physworld.worldmodel.rollout import rollout, rollout_batch
 
@@ -231,6 +231,9 @@ class PublishedModel:
 
     @classmethod
     def _read(cls, tensors: dict[str, Array], facts: dict[str, Any]) -> PublishedModel:
+        if "prior.spread" in tensors:  # chains of earlier versions are straight
+            held = straight(len(tensors["prior.mass"]))
+            tensors = {f"prior.{name}": value for name, value in held.items()} | tensors
         names = WorldModelConfig.__dataclass_fields__
         config = WorldModelConfig(**{name: facts[name] for name in names})
         current = int(tensors["graph.current_neighbours"][0]) if config.near_edges == "current" else 0

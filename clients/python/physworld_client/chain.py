@@ -42,10 +42,11 @@ class Chain:
             speed = 1.5 * speed - 0.5 * (before - older)
         speed = self._free * self._rigid(now, held["smooth"] @ speed)
         slope, turn = 0.5 * (ahead - behind), ahead - 2.0 * here + behind
-        moduli = self._moduli(phi)
+        pull, bend, ease = self._moduli(phi)
+        push = self._steady(now, window[-1, n:], bend)
         even = 0.5 * (
-            self._flow(now, speed, here, slope, turn, *moduli)
-            + self._flow(now, -speed, here, -slope, turn, *moduli)
+            self._flow(now, speed, here, slope, turn, pull, bend, ease, push)
+            + self._flow(now, -speed, here, -slope, turn, pull, bend, ease, push)
         )
         gone = self._rigid(even, even - self._free * before - behind)
         return np.asarray(held["spread"] @ (even + held["keep"] @ gone))
@@ -60,8 +61,9 @@ class Chain:
         pull: Array,
         bend: Array,
         ease: Array,
+        push: Array,
     ) -> Array:
-        """Nodes (K, 3) after a tick; the driven ones are at here + s slope + s²/2 turn."""
+        """Nodes (K, 3) after a tick under a steady ``push``; the driven ones are at here + s slope + s²/2 turn."""
         held, step = self._held, 1.0 / self._substeps
         dash, before = held["dash"][:, None] * self._substeps, None
         for substep in range(self._substeps):
@@ -73,7 +75,7 @@ class Chain:
             before = size
             drawn = np.pad(tension * pulled, ((1, 1), (0, 0)))
             force = np.diff(drawn, axis=0) - held["curve"].T @ (bend * (held["curve"] @ place))
-            velocity = velocity + step * (force * ease + self._free * held["gravity"])
+            velocity = velocity + step * ((force + push) * ease + self._free * held["gravity"])
             now = step * (substep + 1)
             if (substep + 1) % (self._substeps // CALMINGS) == 0:
                 whole = velocity + (1.0 - self._free) * (slope + now * turn)
@@ -94,23 +96,49 @@ class Chain:
         bend = held["bend"] * np.exp(stiff[1:-1])
         return pull[:, None], bend[:, None], self._lightness * np.exp(-heavy)[:, None]
 
+    def _steady(self, places: Array, controls: Array, bend: Array) -> Array:
+        """Force of the natural curvature on the nodes (K, 3); 0 of versions that have none."""
+        held = self._held
+        if not np.any(held.get("natural", 0.0)):
+            return np.zeros_like(places)
+        along = _unit(np.diff(places, axis=0))
+        (first, grip), (last, other) = held["carry"].astype(int)
+        across = np.zeros_like(along)
+        across[first] = _across(self._turned(grip, controls, held["normal"][0]), along[first])
+        for segment in range(first, len(along) - 1):
+            across[segment + 1] = _carried(across[segment], along[segment], along[segment + 1])
+        for segment in range(first, 0, -1):
+            across[segment - 1] = _carried(across[segment], along[segment], along[segment - 1])
+        if grip != other:
+            end = _across(self._turned(other, controls, held["normal"][1]), along[last])
+            beside = np.cross(along[last], across[last])
+            off = np.arctan2(end @ beside, end @ across[last]) - held["twist"][0]
+            off = held["between"][:, None] * np.arctan2(np.sin(off), np.cos(off))
+            across = np.cos(off) * across + np.sin(off) * np.cross(along, across)
+        beside = np.cross(along, across)
+        natural = 0.5 * held["natural"][:, :1] * (across[1:] + across[:-1])
+        natural = natural + 0.5 * held["natural"][:, 1:] * (beside[1:] + beside[:-1])
+        return np.asarray(held["curve"].T @ (bend * natural))
+
     def _driven(self, controls: Array) -> Array:
         """Places of the driven nodes (K, 3) from control vertices (C, 3)."""
         held, places = self._held, np.zeros((len(self._free), 3))
-        for grip, markers in enumerate(held["markers"]):
-            offset = held["offset"]
-            if markers > 1:
-                along = _unit(held["first"][grip] @ controls)
-                if markers == 2:
-                    axis = held["axis"][grip]
-                    turn = np.cross(axis, along)
-                    once = np.cross(turn, offset)
-                    offset = offset + once + np.cross(turn, once) / max(1.0 + axis @ along, LEAN_FLOOR)
-                else:
-                    normal = _unit(np.cross(along, held["second"][grip] @ controls))
-                    offset = offset @ np.stack([along, np.cross(normal, along), normal])
+        for grip in range(len(held["markers"])):
+            offset = self._turned(grip, controls, held["offset"])
             places += held["member"][:, grip, None] * (held["anchor"][grip] @ controls + offset)
         return places
+
+    def _turned(self, grip: int, controls: Array, offset: Array) -> Array:
+        """Vectors (·, 3) of a grip's frame in the world's axes."""
+        held, markers = self._held, self._held["markers"][grip]
+        if markers == 1:
+            return offset
+        along = _unit(held["first"][grip] @ controls)
+        if markers == 2:
+            axis = held["axis"][grip]
+            return _least(np.cross(axis, along), axis @ along, offset)
+        normal = _unit(np.cross(along, held["second"][grip] @ controls))
+        return np.asarray(offset @ np.stack([along, np.cross(normal, along), normal]))
 
     def _rigid(self, place: Array, change: Array) -> Array:
         """``change`` of ``place`` without what lengthens segments."""
@@ -118,6 +146,22 @@ class Chain:
         stretch = (along * np.diff(change, axis=0)).sum(axis=1)
         push = np.pad(along * (self._held["slack"] @ stretch)[:, None], ((1, 1), (0, 0)))
         return np.asarray(change + self._lightness * np.diff(push, axis=0))
+
+
+def _across(vector: Array, along: Array) -> Array:
+    """The unit vector of ``vector`` (3,) without its part along a tangent (3,)."""
+    return _unit(vector - (vector @ along) * along)
+
+
+def _carried(across: Array, along: Array, following: Array) -> Array:
+    """A vector (3,) turned by the least rotation from one tangent to another."""
+    return _least(np.cross(along, following), float(along @ following), across)
+
+
+def _least(axis: Array, cosine: float, vector: Array) -> Array:
+    """Vectors (·, 3) turned about ``axis`` (3,), whose length is the sine."""
+    once = np.cross(axis, vector)
+    return np.asarray(vector + once + np.cross(axis, once) / max(1.0 + cosine, LEAN_FLOOR))
 
 
 def _unit(vector: Array) -> Array:

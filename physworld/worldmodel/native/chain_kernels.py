@@ -12,12 +12,15 @@ from physworld.worldmodel.native.chain_text import ADJOINT, STEP, TEXT, VECTORS
 
 wp.set_module_options({"enable_backward": False})
 
-CHAIN_SIZES = ("chain_nodes", "chain_width", "chain_groups", "chain_substeps", "chain_calms", "chain_lags")
+CHAIN_SIZES = (
+    "chain_nodes", "chain_width", "chain_groups", "chain_substeps", "chain_calms", "chain_lags", "chain_curved",
+)  # fmt: skip
 CHAIN_ARRAYS = (
     "chain_spread", "chain_read", "chain_hold", "chain_member", "chain_offset", "chain_anchor", "chain_first",
     "chain_second", "chain_axis", "chain_markers", "chain_length", "chain_pull", "chain_lightness", "chain_curve",
     "chain_bend", "chain_keep", "chain_calm", "chain_calm_back", "chain_smooth", "chain_slack", "chain_dash",
-    "chain_share", "chain_reach", "chain_gravity", "chain_free", "chain_scratch",
+    "chain_share", "chain_reach", "chain_gravity", "chain_free", "chain_natural", "chain_carry",
+    "chain_normal", "chain_twist", "chain_between", "chain_scratch",
 )  # fmt: skip
 
 
@@ -31,12 +34,12 @@ def unpack(names: tuple[str, ...], table: str, kind: str) -> str:
 
 
 FLOW_ARRAYS = (
-    "places", "velocities", "heres", "slopes", "turns", "pulls", "bends", "eases", "traces",
-    "by_velocities", "by_pulls", "by_bends", "by_eases",
+    "places", "velocities", "heres", "slopes", "turns", "pulls", "bends", "eases", "pushes", "traces",
+    "by_velocities", "by_pulls", "by_bends", "by_eases", "by_pushes",
 )  # fmt: skip
 ROLL_SIZES = ("candidates", "frames", "objects", "vertices", "controls", "first")
 ROLL_ARRAYS = ("paths", "logs")
-SCRATCH_ROWS = 70
+SCRATCH_ROWS = 76
 
 _FLOW_HEAD = (
     VECTORS
@@ -55,10 +58,10 @@ _FLOW = (
         float* trace = traces ? traces + (long long)b * S * 3 * W : nullptr;
         if (!back)
             flow(places + at3, velocities + at3, heres + at3, slopes + at3, turns + at3, pulls + at1, bends + at1,
-                 eases + at1, trace);
+                 eases + at1, pushes + at3, trace);
         else
-            unflow(trace, places + at3, by_velocities + at3, pulls + at1, bends + at1, eases + at1,
-                   by_pulls + at1, by_bends + at1, by_eases + at1);
+            unflow(trace, places + at3, by_velocities + at3, pulls + at1, bends + at1, eases + at1, pushes + at3,
+                   by_pulls + at1, by_bends + at1, by_eases + at1, by_pushes + at3);
     }
 """
 )

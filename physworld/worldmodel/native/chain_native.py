@@ -27,6 +27,7 @@ def chain_sizes(prior: ChainPrior, history: int) -> dict[str, int]:
         "chain_substeps": prior.substeps,
         "chain_calms": CALMINGS if _calms(prior) else 0,
         "chain_lags": min(history, 2) + 1,
+        "chain_curved": int(np.any(prior.natural)),
     }
 
 
@@ -62,7 +63,10 @@ def chain_arrays(prior: ChainPrior) -> dict[str, Array]:
         "free": padded(free),
         "share": share,
     }
-    plain = ("member", "offset", "anchor", "first", "second", "axis", "markers", "reach", "gravity")
+    plain = (
+        "member", "offset", "anchor", "first", "second", "axis", "markers", "reach", "gravity", "natural", "carry",
+        "normal", "twist", "between",
+    )  # fmt: skip
     arrays |= {name: getattr(prior, name) for name in plain}
     return {f"chain_{name}": np.ascontiguousarray(value, dtype=np.float32) for name, value in arrays.items()}
 
@@ -112,13 +116,13 @@ class ChainRoller:
 
 
 class NativeFlow:
-    """The flow of one prior over a tick, differentiable by start, velocity and moduli."""
+    """The flow of one prior over a tick, differentiable by start, velocity, moduli and push."""
 
     def __init__(self, prior: ChainPrior, history: int) -> None:
         self.sizes, self.arrays = chain_sizes(prior, history), chain_arrays(prior)
 
     def __call__(self, *tensors: Tensor) -> Tensor:
-        """Places (K, M, 3) after a tick: place, velocity, here, slope, turn (K, M, 3); pull, bend, ease (K', M, 1)."""
+        """Places (K, M, 3) after a tick, of the arguments of :meth:`ChainStep.flow`."""
         return _flow(self, *tensors)
 
     def launch(self, count: int, given: dict[str, Array], back: bool) -> None:
@@ -149,7 +153,7 @@ class _Flow(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, native: NativeFlow, *tensors: Tensor) -> Tensor:
-        names = ("places", "velocities", "heres", "slopes", "turns", "pulls", "bends", "eases")
+        names = ("places", "velocities", "heres", "slopes", "turns", "pulls", "bends", "eases", "pushes")
         given = {name: native.rows(value) for name, value in zip(names, tensors, strict=True)}
         many = tensors[0].shape[1]
         wanted = any(ctx.needs_input_grad)
@@ -168,7 +172,8 @@ class _Flow(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         native, many = ctx.native, grad.shape[1]
         given = {"places": native.rows(grad), "traces": ctx.trace, **ctx.moduli}
-        given["by_velocities"] = np.zeros_like(given["places"])
+        for name in ("by_velocities", "by_pushes"):
+            given[name] = np.zeros_like(given["places"])
         for name in ("by_pulls", "by_bends", "by_eases"):
             given[name] = np.zeros_like(ctx.moduli["pulls"])
         native.launch(many, given, back=True)
@@ -182,7 +187,7 @@ class _Flow(torch.autograd.Function):
             None,
             *(
                 native.tensor(given[n], like[k])
-                for k, n in ((5, "by_pulls"), (6, "by_bends"), (7, "by_eases"))
+                for k, n in ((5, "by_pulls"), (6, "by_bends"), (7, "by_eases"), (8, "by_pushes"))
             ),
         )
 

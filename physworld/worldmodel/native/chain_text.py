@@ -3,7 +3,8 @@
 Places are kept by component, three rows of nodes with room before and after them, so that neighbours along the chain
 are loads at a shifted address. ``TEXT``, ``ADJOINT`` and ``STEP`` are lambdas over the names in ``CHAIN_SIZES`` and
 ``CHAIN_ARRAYS`` of ``chain_kernels``; ``STEP`` reads the frames of ``path`` beside. Working memory is
-``chain_scratch``, rows of W: 0 to 23 of the flow and its adjoint, 24 to 59 of a step, 60 to 69 the moduli.
+``chain_scratch``, rows of W: 0 to 23 of the flow and its adjoint, 24 to 59 of a step, 60 to 69 the moduli,
+70 to 75 the push of the natural curvature and the directions across the segments.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ TEXT = r"""
     };
     // one tick of the chain from ``place`` and ``velocity``, both changed; driven nodes go here + s slope + s^2/2 turn
     auto flow = [&](float* place, float* velocity, float* here, float* slope, float* turn, const float* pull,
-                    const float* bend, const float* ease, float* trace) {
+                    const float* bend, const float* ease, float* steady, float* trace) {
         float* spare = chain_scratch;
         float *force = spare, *f = spare + 3 * W, *m = spare + 6 * W, *size = spare + 9 * W + 16;
         float* whole = spare + 12 * W;
@@ -72,7 +73,8 @@ TEXT = r"""
             for (int a = 0; a < 3; ++a)
                 for (int c = 0; c < P; c += 16) {
                     V* v = (V*)(row(velocity, a) + c);
-                    *v += step * (at(row(force, a) + c) * at(ease + c) + at(chain_free + c) * chain_gravity[a]);
+                    *v += step * ((at(row(force, a) + c) + at(row(steady, a) + c)) * at(ease + c)
+                        + at(chain_free + c) * chain_gravity[a]);
                 }
             if (s % every == every - 1) {
                 for (int a = 0; a < 3; ++a)
@@ -95,9 +97,10 @@ TEXT = r"""
 """
 
 ADJOINT = r"""
-    // gradients of a loss by the flow's start, velocity, pull, bend and ease from that by its end (in ``to``)
+    // gradients of a loss by the flow's start, velocity, pull, bend, ease and push from that by its end (in ``to``)
     auto unflow = [&](const float* trace, float* to, float* by_velocity, const float* pull, const float* bend,
-                      const float* ease, float* by_pull, float* by_bend, float* by_ease) {
+                      const float* ease, float* steady, float* by_pull, float* by_bend, float* by_ease,
+                      float* by_steady) {
         float* spare = chain_scratch;
         float *force = spare, *f = spare + 3 * W, *m = spare + 6 * W, *size = spare + 9 * W + 16;
         float* whole = spare + 12 * W;
@@ -137,8 +140,9 @@ ADJOINT = r"""
                 V sum = 0.0f;
                 for (int a = 0; a < 3; ++a) {
                     const V v = at(row(by_velocity, a) + c);
-                    sum += v * at(row(force, a) + c);
+                    sum += v * (at(row(force, a) + c) + at(row(steady, a) + c));
                     *(V*)(row(whole, a) + c) = step * at(ease + c) * v;
+                    *(V*)(row(by_steady, a) + c) += at(row(whole, a) + c);
                 }
                 *(V*)(by_ease + c) += step * sum;
             }
@@ -180,49 +184,132 @@ ADJOINT = r"""
 """
 
 STEP = r"""
+    auto crossed = [](const float* p, const float* q, float* r) {
+        for (int a = 0; a < 3; ++a) r[a] = p[(a + 1) % 3] * q[(a + 2) % 3] - p[(a + 2) % 3] * q[(a + 1) % 3];
+    };
+    auto dot = [](const float* p, const float* q) -> float { return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]; };
+    auto unit = [&](float* p) {
+        const float per = 1.0f / __builtin_sqrtf(dot(p, p));
+        for (int a = 0; a < 3; ++a) p[a] *= per;
+    };
+    // out = o turned by the least rotation, whose axis times sine is z and whose cosine is lean - 1
+    auto least = [&](const float* z, float lean, const float* o, float* out) {
+        float once[3], twice[3];
+        if (lean < 1e-6f) lean = 1e-6f;
+        crossed(z, o, once);
+        crossed(z, once, twice);
+        for (int a = 0; a < 3; ++a) out[a] = o[a] + once[a] + twice[a] / lean;
+    };
+    // a grip's middle (3), and what turns its frame: u, y, z (9) and 1 + the cosine of the least rotation, from control
+    // vertices (C, 3)
+    auto grip_of = [&](int g, const float* controls, float* centre, float* frame) -> float {
+        float *u = frame, *y = frame + 3, *z = frame + 6, b[3] = {0, 0, 0};
+        for (int a = 0; a < 3; ++a) centre[a] = u[a] = 0.0f;
+        for (int c = 0; c < C; ++c)
+            for (int a = 0; a < 3; ++a) {
+                centre[a] += chain_anchor[g * C + c] * controls[c * 3 + a];
+                u[a] += chain_first[g * C + c] * controls[c * 3 + a];
+                b[a] += chain_second[g * C + c] * controls[c * 3 + a];
+            }
+        const int markers = (int)chain_markers[g];
+        if (markers > 1) unit(u);
+        if (markers == 2) {
+            crossed(chain_axis + 3 * g, u, z);
+            return 1.0f + dot(chain_axis + 3 * g, u);
+        }
+        if (markers > 2) {
+            crossed(u, b, z);
+            unit(z);
+            crossed(z, u, y);
+        }
+        return 1.0f;
+    };
+    // out = o in the frame of grip g, in the world's axes
+    auto turned_by = [&](int g, const float* frame, float lean, const float* o, float* out) {
+        const int markers = (int)chain_markers[g];
+        const float *u = frame, *y = frame + 3, *z = frame + 6;
+        if (markers == 2) least(z, lean, o, out);
+        for (int a = 0; a < 3 && markers != 2; ++a)
+            out[a] = markers == 1 ? o[a] : o[0] * u[a] + o[1] * y[a] + o[2] * z[a];
+    };
     // places of the driven nodes from control vertices (C, 3)
     auto driven = [&](const float* controls, float* out) {
         clear(out);
         for (int g = 0; g < chain_groups; ++g) {
-            float centre[3] = {0, 0, 0}, u[3] = {0, 0, 0}, b[3] = {0, 0, 0};
-            for (int c = 0; c < C; ++c)
-                for (int a = 0; a < 3; ++a) {
-                    centre[a] += chain_anchor[g * C + c] * controls[c * 3 + a];
-                    u[a] += chain_first[g * C + c] * controls[c * 3 + a];
-                    b[a] += chain_second[g * C + c] * controls[c * 3 + a];
-                }
-            const int markers = (int)chain_markers[g];
-            const float* e = chain_axis + 3 * g;
-            float z[3], y[3], lean = 1.0f;
-            auto cross = [](const float* p, const float* q, float* r) {
-                for (int a = 0; a < 3; ++a) r[a] = p[(a + 1) % 3] * q[(a + 2) % 3] - p[(a + 2) % 3] * q[(a + 1) % 3];
-            };
-            auto unit = [](float* p) {
-                const float per = 1.0f / __builtin_sqrtf(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
-                for (int a = 0; a < 3; ++a) p[a] *= per;
-            };
-            if (markers > 1) unit(u);
-            if (markers == 2) {
-                cross(e, u, z);
-                lean = 1.0f + e[0] * u[0] + e[1] * u[1] + e[2] * u[2];
-                if (lean < 1e-6f) lean = 1e-6f;
-            } else if (markers > 2) {
-                cross(u, b, z);
-                unit(z);
-                cross(z, u, y);
-            }
+            float centre[3], frame[9], turned[3];
+            const float lean = grip_of(g, controls, centre, frame);
             for (int k = 0; k < K; ++k) {
                 if (chain_member[k * chain_groups + g] == 0.0f) continue;
-                const float* o = chain_offset + 3 * k;
-                float turned[3] = {o[0], o[1], o[2]}, once[3], twice[3];
-                if (markers == 2) {
-                    cross(z, o, once);
-                    cross(z, once, twice);
-                    for (int a = 0; a < 3; ++a) turned[a] = o[a] + once[a] + twice[a] / lean;
-                } else if (markers > 2) {
-                    for (int a = 0; a < 3; ++a) turned[a] = o[0] * u[a] + o[1] * y[a] + o[2] * z[a];
-                }
+                turned_by(g, frame, lean, chain_offset + 3 * k, turned);
                 for (int a = 0; a < 3; ++a) row(out, a)[k] = centre[a] + turned[a];
+            }
+        }
+    };
+    // force of the natural curvature on nodes at ``place``, with control vertices (C, 3) and ``bend``
+    auto curving = [&](float* place, const float* controls, const float* bend, float* steady) {
+        clear(steady);
+        if (!chain_curved) return;
+        float* across = chain_scratch + 73 * W;
+        auto tangent = [&](int j, float* t) {
+            for (int a = 0; a < 3; ++a) t[a] = row(place, a)[j + 1] - row(place, a)[j];
+            unit(t);
+        };
+        auto fetch = [&](int j, float* d) { for (int a = 0; a < 3; ++a) d[a] = row(across, a)[j]; };
+        auto store = [&](int j, const float* d) { for (int a = 0; a < 3; ++a) row(across, a)[j] = d[a]; };
+        // the direction that end e's grip holds, across segment j
+        auto held = [&](int e, int j, float* d) {
+            float centre[3], frame[9], t[3];
+            const int g = (int)chain_carry[2 * e + 1];
+            const float lean = grip_of(g, controls, centre, frame);
+            turned_by(g, frame, lean, chain_normal + 3 * e, d);
+            tangent(j, t);
+            const float along = dot(d, t);
+            for (int a = 0; a < 3; ++a) d[a] -= along * t[a];
+            unit(d);
+        };
+        // carry it from segment j to the one beside it
+        auto onward = [&](int j, int next) {
+            float t[3], s[3], z[3], d[3], out[3];
+            tangent(j, t);
+            tangent(next, s);
+            crossed(t, s, z);
+            fetch(j, d);
+            least(z, 1.0f + dot(t, s), d, out);
+            store(next, out);
+        };
+        const int from = (int)chain_carry[0], last = (int)chain_carry[2];
+        float d[3], t[3], e[3];
+        held(0, from, d);
+        store(from, d);
+        for (int j = from; j < K - 2; ++j) onward(j, j + 1);
+        for (int j = from; j > 0; --j) onward(j, j - 1);
+        if (chain_carry[1] != chain_carry[3]) {
+            float end[3];
+            held(1, last, end);
+            tangent(last, t);
+            fetch(last, d);
+            crossed(t, d, e);
+            float off = atan2f(dot(end, e), dot(end, d)) - chain_twist[0];
+            off = atan2f(sinf(off), cosf(off));
+            for (int j = 0; j < K - 1; ++j) {
+                const float c = cosf(chain_between[j] * off), s = sinf(chain_between[j] * off);
+                tangent(j, t);
+                fetch(j, d);
+                crossed(t, d, e);
+                for (int a = 0; a < 3; ++a) row(across, a)[j] = c * d[a] + s * e[a];
+            }
+        }
+        for (int i = 0; i < K - 2; ++i) {
+            float one[3], two[3], s[3], f[3];
+            fetch(i, d);
+            tangent(i, t);
+            crossed(t, d, e);
+            fetch(i + 1, one);
+            tangent(i + 1, s);
+            crossed(s, one, two);
+            for (int a = 0; a < 3; ++a) {
+                f[a] = 0.5f * (chain_natural[2 * i] * (d[a] + one[a]) + chain_natural[2 * i + 1] * (e[a] + two[a]));
+                for (int k = 0; k < 3; ++k) row(steady, a)[i + k] += chain_curve[k * P + i] * bend[i] * f[a];
             }
         }
     };
@@ -305,6 +392,8 @@ STEP = r"""
         apply(chain_smooth, spare, speed, false);
         slacken(now, speed);
         clear(moved);
+        float* steady = chain_scratch + 70 * W;
+        curving(now, frame + N * 3, moduli + W, steady);
         for (int way = 0; way < 2; ++way) {
             const float sign = way ? -1.0f : 1.0f;
             for (int i = 0; i < 3 * W; ++i) {
@@ -315,7 +404,7 @@ STEP = r"""
             for (int a = 0; a < 3; ++a)
                 for (int c = 0; c < P; c += 16)
                     *(V*)(row(two, a) + c) = sign * at(chain_free + c) * at(row(speed, a) + c);
-            flow(one, two, here, slope, turn, moduli, moduli + W, moduli + 2 * W, nullptr);
+            flow(one, two, here, slope, turn, moduli, moduli + W, moduli + 2 * W, steady, nullptr);
             for (int i = 0; i < 3 * W; ++i) moved[i] += 0.5f * one[i];
         }
         for (int a = 0; a < 3; ++a)

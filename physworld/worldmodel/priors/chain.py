@@ -1,7 +1,7 @@
 """The chain prior of ropes: point masses along the centre line, pulled and bent, driven where the grips hold them.
 
-A rope that swings turns by more than any linear map of places can follow (``modal``). Its twin is a curve that is
-straight at rest and carries no twist, and its vertices lie on that curve: they are written in K nodes along it,
+A rope that swings turns by more than any linear map of places can follow (``modal``). Its twin is a curve whose rest
+places lie on a line, and its vertices lie on that curve: they are written in K nodes along it,
 
     q = read · x + hold · q_driven         x = spread · q       (spread: natural cubic spline through the nodes)
     q_driven = c̄_g + R_g · offset          of what grip g holds; c̄_g mean, R_g frame of its control vertices
@@ -10,7 +10,7 @@ and the nodes are moved through one tick by S substeps of the semi-implicit Eule
 
     pulled_j = q_{j+1} - q_j,   bent_i = curve_i · q                       segments j, inner nodes i
     tension_j = pull_j (1 - length_j / |pulled_j|) + dash_j d|pulled_j|/dt / |pulled_j|
-    v̇_k = ease_k (tension_k pulled_k - tension_{k-1} pulled_{k-1} - curveᵀ (bend · bent))_k + gravity
+    v̇_k = ease_k (tension_k pulled_k - tension_{k-1} pulled_{k-1} - curveᵀ (bend · (bent - bent°)))_k + gravity
     v   = calm · v                            CALMINGS times a tick: internal friction of bending, implicitly
 
 A step sees places, no speeds, and must neither damp nor excite what moves freely over hundreds of ticks. So the flow is
@@ -23,8 +23,20 @@ is exact for whatever oscillates: q^{t+1} + q^{t-1} = 2 E without losses. ``keep
 the friction of bending, and a little of the shortest waves. ``rigid`` takes out what stretches segments: stretch waves
 run through the rope many times within a tick, so that they follow the load at once.
 
+A cable that was coiled is not straight when nothing acts. Its natural curvature is fixed in its cross sections, whose
+directions d_j are carried along the rope by the least rotations from one segment's tangent t_j to the next one's
+(Bishop, Amer. Math. Monthly 82, 1975), and are turned evenly between two grips (twist is quasi-static, as in Bergou et
+al. 2008):
+
+    d_a = R_g normal_0, made normal to t_a      a, g = carry_0: the first segment beside a grip, and that grip
+    θ   = angle about t_b from d_b to R_g' normal_1, less ``twist``, in (-π, π]       b, g' = carry_1, the last one
+    d_j is turned about t_j by between_j θ;  d'_j = t_j × d_j;  bent°_i = natural_i1 d̄_i + natural_i2 d̄'_i
+
+with the means d̄ of the two segments at a joint. bent° is taken at q^t and stays through the tick, of which E keeps no
+error of first order either. With one end only, carry_1 = carry_0 and between = 0.
+
 Φ scales what it stands for, node by node: pull and bend by exp(log E/E_fit), masses by exp(log ρ/ρ_fit), both within
-``reach``, for which the substeps are short enough. Ground, contact and twist are not represented.
+``reach``, for which the substeps are short enough. Ground, contact and twist waves are not represented.
 
 Legend: n object vertices, C control vertices, G grips, K nodes; masses per mass density, so that pull and bend are per
 density too. Positions in metres, world axes. NumPy only.
@@ -83,6 +95,7 @@ class ChainPrior:
         length (K-1,) [m], pull (K-1,), mass (K,) [m], curve (K-2, K), bend (K-2,), dash (K-1,): forces.
         keep, calm, smooth (K, K): losses of a tick, of a substep, and of the speed's shortest waves.
         slack (K-1, K-1): pushes along the segments that take a stretch of one of them back.
+        natural (K-2, 2) [1/m], carry (2, 2), normal (2, 3), twist (1,) [rad], between (K-1,): the natural curvature.
         share (K, n): Φ of nodes from vertices; reach (2,): its largest sizes.
         gravity (3,) [m/tick²].
         substeps: S.
@@ -104,6 +117,11 @@ class ChainPrior:
     curve: Array
     bend: Array
     dash: Array
+    natural: Array
+    carry: Array
+    normal: Array
+    twist: Array
+    between: Array
     keep: Array
     calm: Array
     smooth: Array
@@ -130,12 +148,16 @@ class ChainPrior:
             "mass": (nodes,),
             "curve": (inner, nodes),
             "bend": (inner,),
+            "natural": (inner, 2),
+            "carry": (2, 2),
+            "normal": (2, 3),
+            "twist": (1,),
             "slack": (segments, segments),
             "share": (nodes, vertices),
             "reach": (2,),
             "gravity": (3,),
             **dict.fromkeys(("anchor", "first", "second"), (grips, controls)),
-            **dict.fromkeys(("length", "pull", "dash"), (segments,)),
+            **dict.fromkeys(("length", "pull", "dash", "between"), (segments,)),
             **dict.fromkeys(("hold", "keep", "calm", "smooth"), square),
         }
         found = {name: np.shape(getattr(self, name)) for name in expected}
@@ -143,8 +165,22 @@ class ChainPrior:
             raise ValueError(
                 f"{nodes} nodes of {vertices} vertices and {grips} grips, but the prior has {', '.join(wrong)}"
             )
+        ends = np.asarray(self.carry)
+        if not ((ends >= 0) & (ends < [segments, grips])).all():
+            raise ValueError(f"ends {ends.tolist()} of a chain of {segments} segments and {grips} grips")
         if self.substeps < 1 or self.substeps % CALMINGS:
             raise ValueError(f"{self.substeps} substeps; there are {CALMINGS} or a multiple of them")
+
+
+def straight(nodes: int) -> dict[str, Array]:
+    """The fields of the natural curvature of a chain that has none."""
+    return {
+        "natural": np.zeros((nodes - 2, 2), np.float32),
+        "carry": np.zeros((2, 2), np.float32),
+        "normal": np.zeros((2, 3), np.float32),
+        "twist": np.zeros(1, np.float32),
+        "between": np.zeros(nodes - 1, np.float32),
+    }
 
 
 def chain_of(layout: ChainLayout, physics: ChainPhysics, dt_s: float, reach: Array) -> ChainPrior:
@@ -193,6 +229,11 @@ def chain_of(layout: ChainLayout, physics: ChainPhysics, dt_s: float, reach: Arr
         curve=curve,
         bend=stiff * dt_s**2 * width,
         dash=np.full(count - 1, STRETCH_DAMPING * wave * dt_s),
+        natural=np.zeros((count - 2, 2)),
+        carry=layout.carry,
+        normal=layout.normal,
+        twist=np.zeros(1),
+        between=layout.between,
         keep=short @ expm(-dt_s * losses),
         calm=np.linalg.inv(np.eye(count) + dt_s / CALMINGS * physics.friction_s * rate),
         smooth=short,

@@ -1,16 +1,18 @@
-"""Fitting a chain prior to episodes: speed of stretch waves, bending, friction, drag and gravity.
+"""Fitting a chain prior to episodes: speed of stretch waves, bending, friction, drag, gravity, natural curvature.
 
 Least squares on what the chain predicts, open loop: one tick at first, from two stiffnesses, then longer and longer
-windows up to whole episodes. How many segments the chain has is chosen on episodes that the fit did not see.
+windows up to whole episodes. The natural curvature is found between two such fits, by linear least squares on what is
+left of single ticks: its force stays through a tick, so that places are nearly linear in it. How many segments the
+chain has, and whether it is curved, is chosen on episodes that the fit did not see.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from scipy.optimize import least_squares
 
 from physworld.arrays import Array
@@ -18,6 +20,7 @@ from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.native.chain_native import ChainRoller
 from physworld.worldmodel.priors.chain import ChainPhysics, ChainPrior, chain_of
 from physworld.worldmodel.priors.chain_layout import ChainLayout, arc_lengths, held_vertices, lay_out
+from physworld.worldmodel.priors.chain_step import ChainStep
 
 SEGMENTS = (12, 16, 20)
 FITTED = 10  # episodes of the fit, and as many to choose by
@@ -31,6 +34,9 @@ SIZES = np.array([1.0, 1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 SOFT = 0.02  # share of the length beyond which a miss counts linearly
 TOLERANCE = 1e-3  # relative; a figure of the physics is not asked for more
 MARGIN = 0.1  # of Φ beyond what the episodes show
+ROUNDS = 2  # of curvature and the rest in turns
+CLEARLY = 0.95  # times the error of a straight chain: what a curved one must stay below to be taken
+COILS = 1.0  # standard deviation of the natural curvature before anything is seen: so many rings of the rope's length
 
 
 @dataclass(frozen=True)
@@ -72,10 +78,51 @@ def fit_chain(episodes: list[Array], phis: list[Array], spec: GraphSpec, history
         reach = np.array(
             [np.abs(np.stack([layout.share @ phi[:, k] for phi in phis])).max() + MARGIN for k in range(2)]
         )
-        prior = _fit(layout, partial(_chain_at, layout=layout, dt_s=spec.dt_s, reach=reach), taught, history)
+
+        def fitted(
+            curvature: tuple[Array, Array] | None, layout: ChainLayout = layout, reach: Array = reach
+        ) -> ChainPrior:
+            def build(parameters: Array) -> ChainPrior:
+                prior = chain_of(layout, _physics(parameters), spec.dt_s, reach)
+                return replace(prior, natural=curvature[0], twist=curvature[1]) if curvature else prior
+
+            return _fit(layout, build, taught, history)
+
+        prior = fitted(None)
         found.append((_error(prior, judged, history), prior))
+        for _ in range(ROUNDS):
+            prior = fitted(_curvature(prior, taught, history))
+            found.append((_error(prior, judged, history) / CLEARLY, prior))
     best = min(found, key=lambda one: one[0], default=None)
     return None if best is None or not np.isfinite(best[0]) else best[1]
+
+
+def _curvature(prior: ChainPrior, taught: _Seen, history: int) -> tuple[Array, Array]:
+    """``natural`` and ``twist`` that leave least of single ticks, the rest of the prior as it is."""
+    single = _windows(taught, history, 1, WINDOWS[0] + 6)
+    paths = torch.as_tensor(single.paths).permute(1, 2, 0, 3)
+    phi, n, inner = torch.as_tensor(single.phis).transpose(0, 1), single.phis.shape[1], len(prior.bend)
+    step = ChainStep(prior, history)
+
+    def left(natural: Array) -> Array:
+        step.natural, step.curved = torch.as_tensor(natural, dtype=torch.float32).reshape(inner, 2), True
+        gap = paths[-1, :n] - step(paths[:-1], paths[-1, n:], phi)
+        missed: Array = gap.numpy().astype(np.float64).ravel()
+        return missed
+
+    with torch.no_grad():
+        angle = step.frames(*step.nodes_and_controls(paths[-2]))[2].numpy()
+        twist = np.arctan2(np.sin(angle).mean(), np.cos(angle).mean())
+        step.twist = torch.as_tensor([twist], dtype=torch.float32)
+        without = left(np.zeros(2 * inner))
+        slopes = np.stack([left(unit) - without for unit in np.eye(2 * inner)], axis=1)
+    square = slopes.T @ slopes
+    ring = 2.0 * np.pi * COILS / float(prior.length.sum())
+    ridge = (
+        n * np.square(without).mean() / ring**2
+    )  # what is left of a tick is one error, not one of every vertex
+    natural = np.linalg.solve(square + ridge * np.eye(len(square)), -slopes.T @ without).reshape(inner, 2)
+    return natural.astype(np.float32), np.array([twist], np.float32)
 
 
 def _fit(
@@ -122,10 +169,6 @@ def _fit(
         prior = build(parameters)
         best = min(best, (_error(prior, taught, history), prior), key=lambda one: one[0])
     return best[1]
-
-
-def _chain_at(parameters: Array, *, layout: ChainLayout, dt_s: float, reach: Array) -> ChainPrior:
-    return chain_of(layout, _physics(parameters), dt_s, reach)
 
 
 def _physics(parameters: Array) -> ChainPhysics:

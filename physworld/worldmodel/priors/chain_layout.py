@@ -60,16 +60,23 @@ class ChainLayout:
     member: Array
     offset: Array
     share: Array
+    carry: Array
+    normal: Array
+    between: Array
     grips: GripFrames
 
 
 @dataclass(frozen=True)
 class Held:
-    """The grip that holds each vertex, (n,), -1 for none, and where in its frame [m], (n, 3)."""
+    """The grip that holds each vertex, (n,), -1 for none, and where in its frame [m], (n, 3).
+
+    ``tangent`` (G, 3): the mean direction, in each grip's frame, between the two vertices that move least in it.
+    """
 
     grips: GripFrames
     owner: Array
     offset: Array
+    tangent: Array
 
 
 def arc_lengths(spec: GraphSpec) -> Array | None:
@@ -130,12 +137,15 @@ def held_vertices(spec: GraphSpec, paths: Array, length_m: float) -> Held:
     n, grips = spec.object_count, grip_frames(spec)
     controls = paths[:, n:]
     owner, offset, best = np.full(n, -1), np.zeros((n, 3)), np.full(n, HELD[-1] * length_m)
+    tangent = np.zeros((len(grips.markers), 3))
     for g in range(len(grips.markers)):
         centre = np.einsum("c,tcx->tx", grips.anchor[g], controls)
         turns = frame_rotations(grips, g, controls)
         local = np.einsum("tji,tnj->tni", turns, paths[:, :n] - centre[:, None])
         mean = local.mean(axis=0)
         moved = np.sqrt(np.square(local - mean).sum(axis=2).mean(axis=0))
+        still = np.argsort(moved)[:2]
+        tangent[g] = mean[still[1]] - mean[still[0]]
         better = moved < best
         owner[better], offset[better], best[better] = g, mean[better], moved[better]
     for share in HELD:
@@ -143,7 +153,7 @@ def held_vertices(spec: GraphSpec, paths: Array, length_m: float) -> Held:
         if near.any():
             owner[~near] = -1
             break
-    return Held(grips, owner, offset)
+    return Held(grips, owner, offset, tangent / np.linalg.norm(tangent, axis=1, keepdims=True))
 
 
 def lay_out(along: Array, held: Held, segments: int) -> ChainLayout:
@@ -171,6 +181,23 @@ def lay_out(along: Array, held: Held, segments: int) -> ChainLayout:
     hold[np.ix_(free, ~free)] = -pin @ spread[:, ~free]
     hold[~free, ~free] = 1.0
     near = np.exp(-0.5 * np.square((along[None] - nodes[:, None]) / spacing))
-    return ChainLayout(
-        nodes, spread, read, hold, member, offset, near / near.sum(axis=1, keepdims=True), held.grips
-    )
+    share = near / near.sum(axis=1, keepdims=True)
+    carried = _carried(nodes, member, held.tangent)
+    return ChainLayout(nodes, spread, read, hold, member, offset, share, *carried, held.grips)
+
+
+def _carried(nodes: Array, member: Array, tangent: Array) -> tuple[Array, Array, Array]:
+    """``carry`` (2, 2), ``normal`` (2, 3) and ``between`` (K-1,) of ``ChainPrior``.
+
+    A normal is the axis of the grip's frame that is least along ``tangent`` (G, 3), the rope's direction in it.
+    """
+    held = member.sum(axis=1) > 0
+    beside = np.flatnonzero(held[1:] != held[:-1])
+    grips = [int(np.argmax(member[k if held[k] else k + 1])) for k in (beside[0], beside[-1])]
+    ends = [int(beside[0]), int(beside[-1]) if grips[1] != grips[0] else int(beside[0])]
+    carry = np.stack([ends, grips], axis=1)
+    normal = np.eye(3)[np.argmin(np.abs(tangent[grips]), axis=1)]
+    middle = 0.5 * (nodes[1:] + nodes[:-1])
+    way = middle[ends[1]] - middle[ends[0]]
+    between = np.clip((middle - middle[ends[0]]) / way, 0.0, 1.0) if way > 0.0 else np.zeros(len(middle))
+    return carry, normal, between

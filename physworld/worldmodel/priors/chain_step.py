@@ -10,6 +10,7 @@ Legend: B batch, M = 2 B: every sequence with its speed and with the opposite on
 from __future__ import annotations
 
 from dataclasses import fields
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -42,6 +43,11 @@ class ChainStep(nn.Module):
     curve: Tensor
     bend: Tensor
     dash: Tensor
+    natural: Tensor
+    carry: Tensor
+    normal: Tensor
+    twist: Tensor
+    between: Tensor
     keep: Tensor
     calm: Tensor
     smooth: Tensor
@@ -65,6 +71,8 @@ class ChainStep(nn.Module):
         count = len(prior.mass)
         self.prior, self.native = prior, NativeFlow(prior, history)
         self._counts, self._markers = (count - 1, count - 2), [int(number) for number in prior.markers]
+        self._ends = [(int(segment), int(grip)) for segment, grip in prior.carry]
+        self.curved = bool(np.any(prior.natural))
         differ = torch.as_tensor(np.diff(np.eye(count), axis=0), dtype=torch.float32)
         free = (self.member.sum(dim=1) == 0).float()
         for name, value in {
@@ -85,13 +93,16 @@ class ChainStep(nn.Module):
             speed = 1.5 * speed - 0.5 * (before - older)
         speed = self._free * self._rigid(now, _times(self.smooth, speed))
         slope, turn = 0.5 * (ahead - behind), ahead - 2.0 * here + behind
+        pull, bend, ease = self._moduli(phi)
+        push = self._steady(now, window[-1, n:], bend) if self.curved else torch.zeros_like(now)
         moved = self._flow(
             now.repeat(1, 2, 1),
             torch.cat([speed, -speed], dim=1),
             here.repeat(1, 2, 1),
             torch.cat([slope, -slope], dim=1),
             turn.repeat(1, 2, 1),
-            *(modulus.repeat(1, 2)[..., None] for modulus in self._moduli(phi)),
+            *(modulus.repeat(1, 2)[..., None] for modulus in (pull, bend, ease)),
+            push.repeat(1, 2, 1),
         )
         even = 0.5 * (moved[:, :batch] + moved[:, batch:])
         past = self._free * before + behind
@@ -107,6 +118,7 @@ class ChainStep(nn.Module):
         pull: Tensor,
         bend: Tensor,
         ease: Tensor,
+        push: Tensor,
     ) -> Tensor:
         """Nodes (K, M, 3) [m] after a tick, in plain torch.
 
@@ -121,6 +133,7 @@ class ChainStep(nn.Module):
             pull: (wave speed times tick)² over the rest length of the segments (K-1, M, 1) [m].
             bend: of the joints (K-2, M, 1).
             ease: inverse of the nodes' relative mass, 0 for driven ones (K, M, 1).
+            push: force on the nodes that stays through the tick, per density (K, M, 3).
         """
         substeps, every = self.prior.substeps, self.prior.substeps // CALMINGS
         step = 1.0 / substeps
@@ -128,7 +141,7 @@ class ChainStep(nn.Module):
             values.permute(2, 0, 1) for values in (place, step * velocity, here, slope, turn)
         )  # (3, K, M): a matrix times it is one operation
         pull, bend, ease = pull[..., 0], bend[..., 0], step**2 * ease[..., 0]
-        weight = step**2 * (self._free * self.gravity).permute(2, 0, 1)
+        weight = step**2 * (self._free * self.gravity).permute(2, 0, 1) + ease * push.permute(2, 0, 1)
         tense, dash, before = pull * self.length[:, None], self.dash[:, None] * substeps, None
         still, back = 1.0 - self._free[..., 0], -self._differ.T
         times = step * torch.arange(substeps + 1, dtype=place.dtype, device=place.device)[:, None, None, None]
@@ -157,6 +170,35 @@ class ChainStep(nn.Module):
             places = places + self.member[:, grip, None, None] * (centre + offset)
         return places
 
+    def nodes_and_controls(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """Nodes (K, B, 3) and control vertices (C, B, 3) of all vertices of a frame (V, B, 3) [m]."""
+        objects, controls = vertices.split([len(self.spread), len(vertices) - len(self.spread)])  # type: ignore[no-untyped-call]  # torch's has no types
+        return self._nodes(objects, self.driven(controls)), controls
+
+    def frames(self, places: Tensor, controls: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """t_j and d_j (K-1, B, 3), carried from the first end and turned evenly, and the angle at the second end [rad].
+
+        Args:
+            places: of the nodes (K, B, 3) [m].
+            controls: control vertices (C, B, 3) [m].
+
+        The angle (B,) is the one before ``twist`` is taken off, 0 with one end.
+        """
+        along = _unit(_times(self._differ[: self._counts[0]], places))
+        (first, grip), (last, other) = self._ends
+        start = _across(self._fixed(grip, controls, self.normal[0]), along[first])
+        ahead, behind = _carried(along[first:], start), _carried(along[: first + 1].flip(0), start)
+        across = torch.cat([behind.flip(0)[:-1], ahead])
+        if grip == other:
+            return along, across, along.new_zeros(along.shape[1])
+        end = _across(self._fixed(other, controls, self.normal[1]), along[last])
+        beside = torch.linalg.cross(along[last], across[last])
+        angle = torch.atan2((end * beside).sum(dim=-1), (end * across[last]).sum(dim=-1))
+        off = angle - self.twist
+        off = self.between[:, None] * torch.atan2(torch.sin(off), torch.cos(off))
+        turned = torch.cos(off)[..., None] * across
+        return along, turned + torch.sin(off)[..., None] * torch.linalg.cross(along, across), angle
+
     def residual(self, positions: Tensor, phi: Tensor) -> Tensor:
         """What the prior leaves of each step of a track (T, V, 3) with Φ (n, 2): x^{t+1} - x̂^{t+1}, (n, T-1-h, 3)."""
         return one_step_residual(self, positions, phi, self.spread.shape[0], self.history)
@@ -180,8 +222,22 @@ class ChainStep(nn.Module):
         pull = self.pull[:, None] * torch.exp(0.5 * (stiff[1:] + stiff[:-1]))
         return pull, self.bend[:, None] * torch.exp(stiff[1:-1]), self._lightness * torch.exp(-heavy)
 
+    def _steady(self, places: Tensor, controls: Tensor, bend: Tensor) -> Tensor:
+        """Force of the natural curvature on the nodes (K, B, 3), from places, control vertices and bend (K-2, B)."""
+        along, across, _ = self.frames(places, controls)
+        beside = torch.linalg.cross(along, across)
+        one, two = 0.5 * (across[1:] + across[:-1]), 0.5 * (beside[1:] + beside[:-1])
+        natural = self.natural[:, None, :1] * one + self.natural[:, None, 1:] * two
+        return _times(self.curve.T, bend[..., None] * natural)
+
+    def _fixed(self, grip: int, controls: Tensor, vector: Tensor) -> Tensor:
+        """A vector (3,) of a grip's frame in the world's axes, (B, 3)."""
+        own = vector.expand(1, controls.shape[1], 3)
+        markers = self._markers[grip]
+        return (own if markers == 1 else self._turned(grip, markers, controls, own))[0]
+
     def _turned(self, grip: int, markers: int, controls: Tensor, offset: Tensor) -> Tensor:
-        """Offsets (K, B, 3) in the grip's frame, turned into the world's axes."""
+        """Offsets (·, B, 3) in the grip's frame, turned into the world's axes."""
         along = _unit(torch.tensordot(self.first[grip], controls, dims=1))
         if markers == 2:
             axis = torch.linalg.cross(self.axis[grip].expand_as(along), along).expand_as(offset)
@@ -201,6 +257,21 @@ class ChainStep(nn.Module):
         stretch = (along * _times(differ, change)).sum(dim=-1, keepdim=True)
         back = _times(differ.T, along * _times(self.slack, stretch))
         return change - self._lightness[..., None] * back
+
+
+def _carried(along: Tensor, start: Tensor) -> Tensor:
+    """``start`` (B, 3) across the first of some segments, carried by least rotations along all (S, B, 3)."""
+    carried = [start]
+    for one, following in pairwise(along):
+        axis, lean = torch.linalg.cross(one, following), 1.0 + (one * following).sum(dim=-1, keepdim=True)
+        once = torch.linalg.cross(axis, carried[-1])
+        carried.append(carried[-1] + once + torch.linalg.cross(axis, once) / lean.clamp(min=LEAN_FLOOR))
+    return torch.stack(carried)
+
+
+def _across(vector: Tensor, along: Tensor) -> Tensor:
+    """The unit vector of ``vector`` without its part along a tangent, (B, 3)."""
+    return _unit(vector - (vector * along).sum(dim=-1, keepdim=True) * along)
 
 
 def _unit(vector: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from hanging_rope import LENGTH_M, SMALL, episode, graph
 from held_bar import graph as bar_graph
 from physworld_client.network import Network
+from scipy.spatial.transform import Rotation
 
 from physworld.worldmodel import PublishedModel, affine_skin
 from physworld.worldmodel.dataset import Track, read_track
@@ -23,9 +25,9 @@ from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.native.chain_native import ChainRoller
 from physworld.worldmodel.native.engine import RolloutEngine
-from physworld.worldmodel.priors.chain import ChainPhysics, ChainPrior, chain_of
+from physworld.worldmodel.priors.chain import ChainPhysics, ChainPrior, chain_of, straight
 from physworld.worldmodel.priors.chain_fit import fit_chain
-from physworld.worldmodel.priors.chain_layout import Held, arc_lengths, grip_frames, lay_out
+from physworld.worldmodel.priors.chain_layout import Held, arc_lengths, grip_frames, held_vertices, lay_out
 from physworld.worldmodel.priors.chain_step import ChainStep
 from physworld.worldmodel.priors.choose import fit_priors, prior_error
 from physworld.worldmodel.rollout import unroll
@@ -116,9 +118,12 @@ def test_a_limp_chain_swings_at_the_closed_form_s_rate_and_goes_on(swing: float)
         assert period == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.parametrize("coils", [0.0, 8.0])
 @pytest.mark.parametrize("markers", [2, 3])
-def test_the_native_flow_is_the_plain_one_and_so_are_its_gradients(markers: int) -> None:
-    step, n = ChainStep(fitted(markers), SMALL.history), graph(markers).object_count
+def test_the_native_flow_is_the_plain_one_and_so_are_its_gradients(markers: int, coils: float) -> None:
+    prior, n = fitted(markers), graph(markers).object_count
+    natural = coils * np.random.default_rng(7).normal(size=prior.natural.shape)
+    step = ChainStep(replace(prior, natural=natural), SMALL.history)
     tracks = rope(markers)[1]
     window = torch.stack([t.positions[6:9] for t in tracks], dim=2)
     following = torch.stack([t.positions[9, n:] for t in tracks], dim=1)
@@ -134,6 +139,70 @@ def test_the_native_flow_is_the_plain_one_and_so_are_its_gradients(markers: int)
     for native, plain in zip(*found, strict=True):
         assert torch.allclose(native, plain, rtol=1e-3, atol=1e-4 * float(plain.abs().max()))
     assert float(found[0][2].abs().max()) > 0.0
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.5 * np.pi])
+def test_a_coiled_chain_without_gravity_rests_as_the_arc_of_its_curvature_and_turns_with_its_grip(
+    roll: float,
+) -> None:
+    """An elastica without load keeps its natural curvature everywhere; its plane is fixed in the grip."""
+    prior, spec, curvature = _weightless(), graph(3), 2.5
+    natural = np.zeros_like(prior.natural)
+    natural[:, 0] = curvature
+    prior = replace(prior, natural=natural)
+    n = spec.object_count
+    turn = Rotation.from_rotvec([roll, 0.0, 0.0]).as_matrix()
+    rest, control = spec.rest_vertices @ turn.T, rope(3)[1][0].positions[0, n:].double().numpy() @ turn.T
+    begin = np.repeat(rest[None, None], SMALL.history + 1, axis=1).astype(np.float32)
+    driven = np.repeat(control[None, None], 400, axis=1).astype(np.float32)
+    path = ChainRoller(prior, SMALL.history).run(begin, driven, np.zeros((1, n, 2)))[0]
+    nodes = (prior.read @ path[-1, :n] + prior.hold @ _driven_places(prior, driven[0, -1])).astype(np.float64)
+    bent = np.linalg.norm(prior.curve @ nodes, axis=1)[1:-1]
+    assert bent == pytest.approx(curvature, rel=0.05)
+    off_plane = np.linalg.svd(nodes - nodes.mean(axis=0))
+    assert off_plane[1][2] < 0.01 * off_plane[1][0]
+    straight_up = off_plane[2][2] @ turn @ np.array(_normal_of_the_arc(prior))
+    assert abs(straight_up) > 0.99
+
+
+def test_a_fit_finds_the_coil_of_a_chain() -> None:
+    spec, n = graph(3), graph(3).object_count
+    natural = np.stack(
+        [4.0 * np.ones(len(fitted(3).bend)), np.linspace(-3.0, 3.0, len(fitted(3).bend))], axis=1
+    )
+    coiled = replace(fitted(3), natural=natural)
+    tracks = [t for part in rope(3) for t in part]
+    start = np.stack([t.positions[: SMALL.history + 1, :n].numpy() for t in tracks])
+    driven = np.stack([t.positions[:, n:].numpy() for t in tracks])
+    phis = [t.phi.numpy() for t in tracks]
+    paths = [*ChainRoller(coiled, SMALL.history).run(start, driven, np.stack(phis))]
+    found = fit_chain(paths, phis, spec, SMALL.history)
+    assert found is not None and np.any(found.natural)
+    judged = [Track(torch.as_tensor(p), t.phi) for p, t in zip(paths[-3:], tracks[-3:], strict=True)]
+    without = replace(found, natural=np.zeros_like(found.natural))
+    error = prior_error(found, judged, spec, SMALL.history)
+    assert error < 0.3 * prior_error(without, judged, spec, SMALL.history)
+    assert found.natural[2:-2, 0].mean() == pytest.approx(4.0, rel=0.25)
+
+
+def test_a_chain_of_an_earlier_version_is_straight() -> None:
+    model, track = network(3), rope(3)[1][0]
+    whole = _published(model, track)
+    held = whole.to_tensors()
+    older = {k: v for k, v in held.items() if k.removeprefix("prior.") not in straight(3)}
+    assert len(older) == len(held) - 5
+    again = PublishedModel.from_tensors(older, whole.facts()).model
+    n = graph(3).object_count
+    inputs = track.positions[4:7, :, None], track.positions[7, n:, None], track.phi[:, None]
+    plain = replace(fitted(3), natural=np.zeros_like(fitted(3).natural))
+    with torch.no_grad():
+        expected = ChainStep(plain, SMALL.history)(*inputs)
+        assert torch.allclose(again.prior(*inputs), expected, atol=ROUND_OFF_M)
+
+
+def test_ends_that_a_chain_does_not_have_are_refused() -> None:
+    with pytest.raises(ValueError, match="segments and 1 grips"):
+        replace(fitted(3), carry=np.array([[0, 0], [0, 1]]))
 
 
 @pytest.mark.parametrize("markers", [2, 3])
@@ -206,9 +275,30 @@ def _pendulum() -> tuple[ChainPrior, np.ndarray]:
     one = type(frames)(np.ones((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 3)), np.ones(1))
     owner, offset = np.full(len(along), -1), np.zeros((len(along), 3))
     owner[top] = 0
-    layout = lay_out(along, Held(one, owner, offset), 16)
+    layout = lay_out(along, Held(one, owner, offset, np.array([[0.0, 0.0, 1.0]])), 16)
     physics = ChainPhysics(40.0, 1e-6, 1e-4, 0.0, np.array([0.0, 0.0, -9.81]))
     return chain_of(layout, physics, 1.0 / 30.0, np.zeros(2)), -along
+
+
+def _weightless() -> ChainPrior:
+    """A chain on the grip of three markers, in a liquid without gravity."""
+    spec = graph(3)
+    along = arc_lengths(spec)
+    assert along is not None
+    paths = np.concatenate([t.positions[::5].double().numpy() for t in rope(3)[0]])
+    layout = lay_out(along, held_vertices(spec, paths, LENGTH_M), 16)
+    return chain_of(layout, ChainPhysics(20.0, 1e-2, 2e-2, 4.0, np.zeros(3)), 1.0 / 30.0, np.zeros(2))
+
+
+def _driven_places(prior: ChainPrior, controls: np.ndarray) -> np.ndarray:
+    """Driven nodes (K, 3) of control vertices (C, 3)."""
+    return ChainStep(prior, SMALL.history).driven(torch.as_tensor(controls)[:, None])[:, 0].numpy()
+
+
+def _normal_of_the_arc(prior: ChainPrior) -> np.ndarray:
+    """Normal of the plane of a positive first curvature, in the grip's frame, for a rope along x there."""
+    across = prior.normal[0] - prior.normal[0] @ [1.0, 0.0, 0.0] * np.array([1.0, 0.0, 0.0])
+    return np.cross([1.0, 0.0, 0.0], across / np.linalg.norm(across))
 
 
 def _bessel_mode(prior: ChainPrior) -> np.ndarray:

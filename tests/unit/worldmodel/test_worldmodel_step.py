@@ -75,7 +75,7 @@ def bar(
     return moving(config, spec, prior), given
 
 
-def rope(markers: int) -> tuple[WorldModel, Inputs]:
+def rope(markers: int, *, coiled: bool = False) -> tuple[WorldModel, Inputs]:
     config, spec = hanging_rope.SMALL, hanging_rope.graph(markers)
     path = read_track(spec, hanging_rope.episode(0, markers=markers), config.history).positions.numpy()
     along = arc_lengths(spec)
@@ -83,6 +83,9 @@ def rope(markers: int) -> tuple[WorldModel, Inputs]:
     layout = lay_out(along, held_vertices(spec, path[::5].astype(float), float(np.ptp(along))), 12)
     physics = ChainPhysics(20.0, 3e-3, 5e-3, 0.1, np.array([0.0, 0.0, -9.81]))
     prior = chain_of(layout, physics, spec.dt_s, np.array([0.6, 0.6]))
+    if coiled:
+        natural = np.random.default_rng(7).normal(0.0, 8.0, prior.natural.shape).astype(np.float32)
+        prior = dataclasses.replace(prior, natural=natural, twist=np.array([0.7], np.float32))
     return moving(config, spec, prior), inputs(spec, config, path, 6)
 
 
@@ -180,6 +183,8 @@ BODIES: dict[str, Callable[[], tuple[WorldModel, Inputs]]] = {
     "no prior": lambda: bar(held_bar.SMALL, None, alone=True),
     "chain prior, grips of two markers": lambda: rope(2),
     "chain prior, grips of three markers": lambda: rope(3),
+    "coiled chain between two grips": lambda: rope(2, coiled=True),
+    "coiled chain on one grip": lambda: rope(3, coiled=True),
 }
 
 
