@@ -20,8 +20,7 @@ PhysworldError
 ├── TrackingFailed          pictures show too little of the object to follow it
 ├── SplatNotFitted          or too little to fit a splat to
 ├── Cancelled               the caller asked to stop
-├── WorkerLost              a process that shares simulations ended
-└── TrainingDiverged        a loss or a weight is not finite
+└── WorkerLost              a process that shares simulations ended
 """
 
 from __future__ import annotations
@@ -105,10 +104,6 @@ class Cancelled(PhysworldError):
 
 class WorkerLost(PhysworldError):
     """A process that shares simulations ended."""
-
-
-class TrainingDiverged(PhysworldError):
-    """A loss or a weight is not finite."""
 
 
 class GaussiansUnreadable(PhysworldError):

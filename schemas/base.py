@@ -251,10 +251,3 @@ def _told(fault: ErrorDetails, known: Iterable[str]) -> InitErrorDetails:
     said = meant(str(place[0]), known) if kind == "extra_forbidden" and len(place) == 1 else fault["msg"]
     text = PydanticCustomError(kind, _LITERAL, {"said": said})
     return InitErrorDetails(type=text, loc=place, input=fault["input"])
-
-
-class Figures(Resource):
-    """A free table of JSON figures (metrics, parameters) with the time at which it was made."""
-
-    made_at: datetime | None = Field(default=None, description="When they were made.")
-    values: dict[str, Any] = Field(default_factory=dict, description="The figures.")

@@ -28,7 +28,6 @@ from sqlalchemy import (
     make_url,
     select,
     table,
-    text,
 )
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -298,8 +297,3 @@ def _reasons(error: DBAPIError) -> tuple[str, str]:
     if "silent" in reason or "timeout" in reason:
         return reason, "the database did not answer in time"
     return reason, "the database cannot be reached or refuses to work"
-
-
-def ping(session: Session) -> None:
-    """One round trip to the database."""
-    session.execute(text("SELECT 1"))

@@ -15,8 +15,9 @@ from physworld_storage.errors import NotFound
 from physworld_storage.jobs.kind import output_of
 from physworld_storage.jobs.kinds import loop
 from physworld_storage.pages import page_of
+from physworld_storage.rows import required
 from physworld_storage.tables import AssessmentRow, JobRow, ModelVersionRow, TraceRow
-from physworld_storage.traces import get_assessment, get_trace, leaves_twin, trace_row
+from physworld_storage.traces import get_assessment, get_trace, leaves_twin
 
 
 def get_loop(session: Session, loop_id: str) -> Loop:
@@ -148,7 +149,7 @@ def _effects_of(session: Session, model: str, version: int) -> set[str]:
     row = session.get(ModelVersionRow, (model, version))
     if row is None or row.trace_id is None:
         return set()
-    traced = trace_row(session, row.trace_id)
+    traced = required(session, TraceRow, row.trace_id)
     return {effect["name"] for effect in traced.report.get("effects", ())} if leaves_twin(traced) else set()
 
 

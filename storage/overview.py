@@ -15,6 +15,7 @@ from physworld_schemas.base import Page
 from physworld_schemas.job import TERMINAL_STATES, Event, Job
 from physworld_storage.jobs.kinds import KINDS
 from physworld_storage.pages import page_of
+from physworld_storage.rows import chosen
 from physworld_storage.search import matching_jobs
 from physworld_storage.tables import (
     DatasetRow,
@@ -70,8 +71,7 @@ def list_top_jobs(
         InvalidCursor: no list of jobs gave this cursor out.
     """
     statement = matching_jobs(select(JobRow).where(JobRow.parent_id.is_(None)), search)
-    if state is not None:
-        statement = statement.where(JobRow.state == state)
+    statement = chosen(statement, (JobRow.state, state))
     keys = (JobRow.created_at, JobRow.id)
     return page_of(session, statement, keys, _job, limit=limit, cursor=cursor)
 

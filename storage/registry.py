@@ -17,6 +17,7 @@ from physworld_schemas.base import Artifact, Lineage, Page, Unmade
 from physworld_schemas.model import Model, ModelVersion, TrainingConfig, VersionPatch
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
+from physworld_storage.rows import chosen
 from physworld_storage.search import matching
 from physworld_storage.tables import (
     AliasRow,
@@ -229,8 +230,7 @@ def list_versions(
         ModelVersionRow.state,
     )
     statement = matching(statement, search, *columns)
-    if state is not None:
-        statement = statement.where(ModelVersionRow.state == state)
+    statement = chosen(statement, (ModelVersionRow.state, state))
     return page_of(
         session,
         statement,

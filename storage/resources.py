@@ -6,7 +6,7 @@ by the commit of its last shard (``physworld_storage.jobs.flow``); what is ready
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session, defer
@@ -18,6 +18,7 @@ from physworld_schemas.ids import new_id
 from physworld_schemas.scene import Scene, ScenePatch
 from physworld_storage.errors import Conflict, NotFound, ResultInvalid
 from physworld_storage.pages import page_of
+from physworld_storage.rows import chosen, pending, plain, required
 from physworld_storage.search import listing, matching
 from physworld_storage.tables import (
     DatasetRow,
@@ -29,7 +30,6 @@ from physworld_storage.tables import (
     utc_now,
 )
 
-Row = TypeVar("Row", SceneRow, FitRow, DatasetRow)
 _LIFTED = (
     "numerics",
     "converged",
@@ -99,7 +99,7 @@ def create_scene(
         "test": list(test),
         "declared": declared or {},
         "warnings": list(warnings or []),
-        "artifacts": _plain(artifacts or []),
+        "artifacts": plain(artifacts or []),
         "tags": list(tags or []),
     }
     insert_if_absent(session, SceneRow, values)
@@ -109,7 +109,7 @@ def create_scene(
 
 def get_scene(session: Session, scene_id: str) -> Scene:
     """The scene, or NotFound."""
-    return _scene(_required(session, SceneRow, "scene", scene_id))
+    return _scene(required(session, SceneRow, scene_id))
 
 
 def find_scene(session: Session, digest: str) -> Scene | None:
@@ -152,8 +152,7 @@ def list_scenes(
     """
     statement = select(SceneRow).options(defer(SceneRow.declared, raiseload=True))
     statement = matching(statement, search, SceneRow.id, SceneRow.name, SceneRow.kind, SceneRow.tags)
-    if kind is not None:
-        statement = statement.where(SceneRow.kind == kind)
+    statement = chosen(statement, (SceneRow.kind, kind))
     if tag is not None:
         statement = statement.where(listing(SceneRow.tags, tag))
     keys = (SceneRow.created_at, SceneRow.id)
@@ -162,7 +161,7 @@ def list_scenes(
 
 def get_fit(session: Session, fit_id: str) -> Fit:
     """The fit, or NotFound."""
-    return _fit(_required(session, FitRow, "fit", fit_id))
+    return _fit(required(session, FitRow, fit_id))
 
 
 def list_fits(
@@ -188,10 +187,7 @@ def list_fits(
         InvalidCursor: no list of fits gave this cursor out.
     """
     statement = matching(select(FitRow), search, FitRow.id, FitRow.state, scene_id=FitRow.scene_id)
-    if state is not None:
-        statement = statement.where(FitRow.state == state)
-    if scene_id is not None:
-        statement = statement.where(FitRow.scene_id == scene_id)
+    statement = chosen(statement, (FitRow.state, state), (FitRow.scene_id, scene_id))
     return page_of(session, statement, (FitRow.created_at, FitRow.id), _fit, limit=limit, cursor=cursor)
 
 
@@ -217,28 +213,19 @@ def mark_fit_ready(
         NotFound: there is no such fit.
         Conflict: it is not pending.
     """
-    row = _required(session, FitRow, "fit", fit_id)
-    if row.state != "pending":
-        raise Conflict(f"fit {fit_id} is {row.state}; only a pending fit can become ready")
+    row = pending(session, FitRow, fit_id)
     row.state = "ready"
     row.parameters = {name: parameter.model_dump(mode="json") for name, parameter in parameters.items()}
     row.metrics = {**row.metrics, **metrics}  # which other recordings were asked for stays
-    row.artifacts = _plain(artifacts)
+    row.artifacts = plain(artifacts)
     row.lineage = lineage.model_dump(mode="json")
     session.flush()
     return _fit(row)
 
 
-def end_fit(session: Session, fit_id: str, state: Unmade) -> None:
-    """Mark a pending fit failed or cancelled; a ready one stays as it is."""
-    row = _required(session, FitRow, "fit", fit_id)
-    if row.state == "pending":
-        row.state = state
-
-
 def get_dataset(session: Session, dataset_id: str) -> Dataset:
     """The dataset, or NotFound."""
-    return _dataset(_required(session, DatasetRow, "dataset", dataset_id))
+    return _dataset(required(session, DatasetRow, dataset_id))
 
 
 def list_datasets(
@@ -267,20 +254,15 @@ def list_datasets(
     """
     columns = (DatasetRow.id, DatasetRow.state)
     statement = matching(select(DatasetRow), search, *columns, scene_id=DatasetRow.scene_id)
-    for column, wanted in (
-        (DatasetRow.state, state),
-        (DatasetRow.fit_id, fit_id),
-        (DatasetRow.scene_id, scene_id),
-    ):
-        if wanted is not None:
-            statement = statement.where(column == wanted)
+    filters = ((DatasetRow.state, state), (DatasetRow.fit_id, fit_id), (DatasetRow.scene_id, scene_id))
+    statement = chosen(statement, *filters)
     keys = (DatasetRow.created_at, DatasetRow.id)
     return page_of(session, statement, keys, _dataset, limit=limit, cursor=cursor)
 
 
 def start_writing(session: Session, dataset_id: str) -> None:
     """The dataset is planned; episodes follow."""
-    row = _required(session, DatasetRow, "dataset", dataset_id)
+    row = required(session, DatasetRow, dataset_id)
     if row.state != "pending":
         raise Conflict(f"dataset {dataset_id} is {row.state}; only a pending dataset can be planned")
     row.state = "writing"
@@ -302,7 +284,7 @@ def add_episode(
         NotFound: there is no such dataset.
         Conflict: the dataset is sealed or has failed.
     """
-    row = _required(session, DatasetRow, "dataset", dataset_id)
+    row = required(session, DatasetRow, dataset_id)
     if row.state != "writing":
         raise Conflict(f"dataset {dataset_id} is {row.state}; episodes are added while it is being written")
     values = episode.model_dump()
@@ -336,7 +318,7 @@ def list_episodes(
         NotFound: there is no such dataset.
         InvalidCursor: no list of episodes gave this cursor out.
     """
-    _required(session, DatasetRow, "dataset", dataset_id)
+    required(session, DatasetRow, dataset_id)
     statement = select(EpisodeRow).where(EpisodeRow.dataset_id == dataset_id)
     return page_of(
         session, statement, (EpisodeRow.index,), _episode, limit=limit, cursor=cursor, ascending=True
@@ -345,7 +327,7 @@ def list_episodes(
 
 def all_episodes(session: Session, dataset_id: str) -> list[Episode]:
     """Every committed episode of a dataset, by index: what the seal writes into the manifest."""
-    _required(session, DatasetRow, "dataset", dataset_id)
+    required(session, DatasetRow, dataset_id)
     statement = select(EpisodeRow).where(EpisodeRow.dataset_id == dataset_id).order_by(EpisodeRow.index)
     return [_episode(row) for row in session.scalars(statement)]
 
@@ -374,7 +356,7 @@ def seal_dataset(
         Conflict: it is not being written.
         ResultInvalid: fewer or more episodes were committed than were counted.
     """
-    row = _required(session, DatasetRow, "dataset", dataset_id)
+    row = required(session, DatasetRow, dataset_id)
     if row.state != "writing":
         raise Conflict(f"dataset {dataset_id} is {row.state}; only one that is being written is sealed")
     statement = select(func.count()).select_from(EpisodeRow).where(EpisodeRow.dataset_id == dataset_id)
@@ -385,7 +367,7 @@ def seal_dataset(
     row.state = "sealed"
     row.digest = digest
     row.statistics = statistics
-    row.artifacts = _plain(artifacts)
+    row.artifacts = plain(artifacts)
     row.lineage = lineage.model_dump(mode="json")
     session.flush()
     return _dataset(row)
@@ -393,20 +375,9 @@ def seal_dataset(
 
 def end_dataset(session: Session, dataset_id: str, state: Unmade) -> None:
     """Mark a dataset failed or cancelled unless it is sealed."""
-    row = _required(session, DatasetRow, "dataset", dataset_id)
+    row = required(session, DatasetRow, dataset_id)
     if row.state != "sealed":
         row.state = state
-
-
-def _required(session: Session, table: type[Row], kind: str, identifier: str) -> Row:
-    row = session.get(table, identifier)
-    if row is None:
-        raise NotFound(kind, identifier)
-    return row
-
-
-def _plain(artifacts: list[Artifact]) -> list[dict[str, Any]]:
-    return [artifact.model_dump(mode="json") for artifact in artifacts]
 
 
 def _scene(row: SceneRow) -> Scene:

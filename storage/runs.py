@@ -8,11 +8,12 @@ from pydantic import BaseModel
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from physworld_schemas.base import Artifact, Lineage, Page, Unmade
+from physworld_schemas.base import Artifact, Lineage, Page
 from physworld_schemas.plan import Plan
 from physworld_schemas.rollout import Rollout
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
+from physworld_storage.rows import chosen, plain
 from physworld_storage.search import matching
 from physworld_storage.tables import RunRow, columns_of
 
@@ -125,23 +126,9 @@ def mark_run_ready(
         raise Conflict(f"{kind} {run_id} is {row.state}; only a pending one can become ready")
     row.state = "ready"
     row.figures = figures
-    row.artifacts = [*row.artifacts, *(artifact.model_dump(mode="json") for artifact in artifacts)]
+    row.artifacts = [*row.artifacts, *plain(artifacts)]
     row.lineage = lineage.model_dump(mode="json")
     session.flush()
-
-
-def end_run(session: Session, kind: RunKind, run_id: str, state: Unmade) -> None:
-    """Mark a pending run failed or cancelled; a ready one stays as it is.
-
-    Args:
-        session: the transaction that it belongs to.
-        kind: of the run.
-        run_id: the run.
-        state: failed or cancelled.
-    """
-    row = run_row(session, kind, run_id)
-    if row.state == "pending":
-        row.state = state
 
 
 def run_digest(artifacts: list[Artifact], kind: RunKind) -> str | None:
@@ -168,8 +155,7 @@ def _page(
 ) -> Page[Wire]:
     statement = select(RunRow).where(RunRow.kind == kind)
     statement = matching(statement, search, RunRow.id, RunRow.model, RunRow.state)
-    if model is not None:
-        statement = statement.where(RunRow.model == model)
+    statement = chosen(statement, (RunRow.model, model))
     keys = (RunRow.created_at, RunRow.id)
     return page_of(session, statement, keys, lambda row: _wire(wire, row), limit=limit, cursor=cursor)
 

@@ -7,7 +7,7 @@ in ``jobs`` and ``shards``; ``fits``, ``datasets`` and ``model_versions`` are wh
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, ClassVar
 
 from sqlalchemy import (
     JSON,
@@ -65,8 +65,13 @@ class UtcDateTime(TypeDecorator[datetime]):
 
 
 class Base(DeclarativeBase):
-    """Names of constraints are fixed so that migrations can speak of them."""
+    """Names of constraints are fixed so that migrations can speak of them.
 
+    Attributes:
+        noun: what one row is called, where rows are asked for by their id.
+    """
+
+    noun: ClassVar[str]
     metadata = MetaData(
         naming_convention={
             "ix": "ix_%(table_name)s_%(column_0_N_name)s",
@@ -101,6 +106,7 @@ class SceneRow(Base):
     """A measured recording; its arrays are an artifact."""
 
     __tablename__ = "scenes"
+    noun = "scene"
 
     id: Mapped[str] = mapped_column(primary_key=True)
     name: Mapped[str]
@@ -129,6 +135,7 @@ class JobRow(Base):
     """
 
     __tablename__ = "jobs"
+    noun = "job"
     __table_args__ = (
         Index(None, "state"),
         Index(None, "created_at"),
@@ -209,97 +216,85 @@ class EventRow(Base):
     data: Mapped[Json]
 
 
-class FitRow(Base):
+class Made(Base):
+    """What a job brings forth: pending until the last shard of the job is committed."""
+
+    __abstract__ = True
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    state: Mapped[str]
+    created_at: Mapped[datetime]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    config: Mapped[Json]
+    lineage: Mapped[Json]
+
+
+class FitRow(Made):
     """A calibrated twin."""
 
     __tablename__ = "fits"
+    noun = "fit"
     __table_args__ = (Index(None, "created_at"),)
 
-    id: Mapped[str] = mapped_column(primary_key=True)
     scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
-    state: Mapped[str]
-    created_at: Mapped[datetime]
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
-    config: Mapped[Json]
     parameters: Mapped[Json]
     metrics: Mapped[Json]
-    lineage: Mapped[Json]
     artifacts: Mapped[JsonList]
 
 
-class TraceRow(Base):
+class TraceRow(Made):
     """A residual traced to an effect; ``report`` is the whole answer, beginning with the other recordings asked for."""
 
     __tablename__ = "traces"
+    noun = "trace"
     __table_args__ = (Index(None, "created_at"),)
 
-    id: Mapped[str] = mapped_column(primary_key=True)
     scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
     fit_id: Mapped[str | None] = mapped_column(ForeignKey("fits.id"))
-    state: Mapped[str]
-    created_at: Mapped[datetime]
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
-    config: Mapped[Json]
     fit: Mapped[Json]
     verdict: Mapped[str | None]
     report: Mapped[Json]
-    lineage: Mapped[Json]
     artifacts: Mapped[JsonList]
 
 
-class CheckRow(Base):
+class CheckRow(Made):
     """What a scene's motion can show; ``report`` is the whole answer."""
 
     __tablename__ = "checks"
+    noun = "check"
     __table_args__ = (Index(None, "created_at"),)
 
-    id: Mapped[str] = mapped_column(primary_key=True)
     scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
-    state: Mapped[str]
-    created_at: Mapped[datetime]
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
-    config: Mapped[Json]
     report: Mapped[Json | None]
-    lineage: Mapped[Json]
 
 
-class VideoRow(Base):
+class VideoRow(Made):
     """A film of a motion; ``report`` says what was drawn."""
 
     __tablename__ = "videos"
+    noun = "video"
     __table_args__ = (Index(None, "created_at"), Index(None, "of", "source_id"))
 
-    id: Mapped[str] = mapped_column(primary_key=True)
     of: Mapped[str]
     source_id: Mapped[str]
     scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
-    state: Mapped[str]
-    created_at: Mapped[datetime]
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
-    config: Mapped[Json]
     report: Mapped[Json | None]
-    lineage: Mapped[Json]
     artifacts: Mapped[JsonList]
 
 
-class DatasetRow(Base):
+class DatasetRow(Made):
     """A set of episodes, immutable once sealed."""
 
     __tablename__ = "datasets"
+    noun = "dataset"
     __table_args__ = (Index(None, "created_at"),)
 
-    id: Mapped[str] = mapped_column(primary_key=True)
     fit_id: Mapped[str] = mapped_column(ForeignKey("fits.id"), index=True)
     trace_id: Mapped[str | None]
     scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
-    state: Mapped[str]
-    created_at: Mapped[datetime]
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
-    config: Mapped[Json]
     episodes_done: Mapped[int] = mapped_column(default=0)
     digest: Mapped[str | None]
     statistics: Mapped[Json]
-    lineage: Mapped[Json]
     artifacts: Mapped[JsonList]
 
 
@@ -370,26 +365,21 @@ class AliasRow(Base):
     updated_at: Mapped[datetime]
 
 
-class AssessmentRow(Base):
+class AssessmentRow(Made):
     """A new recording held against a model version; ``figures`` is the answer."""
 
     __tablename__ = "assessments"
+    noun = "assessment"
     __table_args__ = (
         ForeignKeyConstraint(["name", "version"], ["model_versions.name", "model_versions.version"]),
         Index(None, "name", "version", "created_at"),
     )
 
-    id: Mapped[str] = mapped_column(primary_key=True)
     name: Mapped[str]
     version: Mapped[int]
     scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"))
-    state: Mapped[str]
-    created_at: Mapped[datetime]
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
-    config: Mapped[Json]
     figures: Mapped[Json]
     trace_id: Mapped[str | None]
-    lineage: Mapped[Json]
 
 
 class SigningKeyRow(Base):
@@ -470,25 +460,20 @@ class IdempotencyRow(Base):
     body: Mapped[bytes | None] = mapped_column(LargeBinary)
 
 
-class RunRow(Base):
+class RunRow(Made):
     """A rollout or a plan made with a model version; ``figures`` is the answer beside its artifacts."""
 
     __tablename__ = "model_runs"
+    noun = "run"
     __table_args__ = (
         ForeignKeyConstraint(["model", "version"], ["model_versions.name", "model_versions.version"]),
         Index(None, "kind", "created_at"),
     )
 
-    id: Mapped[str] = mapped_column(primary_key=True)
     kind: Mapped[str]
     model: Mapped[str]
     version: Mapped[int]
-    state: Mapped[str]
-    created_at: Mapped[datetime]
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
-    config: Mapped[Json]
     figures: Mapped[Json]
-    lineage: Mapped[Json]
     artifacts: Mapped[JsonList]
 
 

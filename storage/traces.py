@@ -8,10 +8,10 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from physworld_schemas.assessment import Assessment
-from physworld_schemas.base import Artifact, Lineage, Page, Unmade
+from physworld_schemas.base import Artifact, Lineage, Page
 from physworld_schemas.trace import Trace
-from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
+from physworld_storage.rows import chosen, pending, plain, required
 from physworld_storage.search import matching
 from physworld_storage.tables import AssessmentRow, FitRow, TraceRow, columns_of
 
@@ -24,7 +24,7 @@ DECLARED = "declared.npz"
 
 def get_trace(session: Session, trace_id: str) -> Trace:
     """The trace, or NotFound."""
-    return _trace(trace_row(session, trace_id))
+    return _trace(required(session, TraceRow, trace_id))
 
 
 def list_traces(
@@ -53,13 +53,8 @@ def list_traces(
     """
     columns = (TraceRow.id, TraceRow.state, TraceRow.verdict)
     statement = matching(select(TraceRow), search, *columns, scene_id=TraceRow.scene_id)
-    for column, wanted in (
-        (TraceRow.state, state),
-        (TraceRow.scene_id, scene_id),
-        (TraceRow.verdict, verdict),
-    ):
-        if wanted is not None:
-            statement = statement.where(column == wanted)
+    filters = ((TraceRow.state, state), (TraceRow.scene_id, scene_id), (TraceRow.verdict, verdict))
+    statement = chosen(statement, *filters)
     return page_of(session, statement, (TraceRow.created_at, TraceRow.id), _trace, limit=limit, cursor=cursor)
 
 
@@ -85,30 +80,13 @@ def mark_trace_ready(
         NotFound: there is no such trace.
         Conflict: it is not pending.
     """
-    row = trace_row(session, trace_id)
-    if row.state != "pending":
-        raise Conflict(f"trace {trace_id} is {row.state}; only a pending trace can become ready")
+    row = pending(session, TraceRow, trace_id)
     row.state = "ready"
     row.verdict = verdict
     row.report = {**row.report, **report}  # a pending one holds the other recordings
-    row.artifacts = [artifact.model_dump(mode="json") for artifact in artifacts]
+    row.artifacts = plain(artifacts)
     row.lineage = lineage.model_dump(mode="json")
     session.flush()
-
-
-def end_trace(session: Session, trace_id: str, state: Unmade) -> None:
-    """Mark a pending trace failed or cancelled; a ready one stays as it is."""
-    row = trace_row(session, trace_id)
-    if row.state == "pending":
-        row.state = state
-
-
-def trace_row(session: Session, trace_id: str) -> TraceRow:
-    """The row, or NotFound."""
-    row = session.get(TraceRow, trace_id)
-    if row is None:
-        raise NotFound("trace", trace_id)
-    return row
 
 
 def leaves_twin(trace: Trace | TraceRow) -> bool:
@@ -129,7 +107,7 @@ def trace_digest(trace: TraceRow) -> str | None:
 
 def get_assessment(session: Session, assessment_id: str) -> Assessment:
     """The assessment, or NotFound."""
-    return _assessment(assessment_row(session, assessment_id))
+    return _assessment(required(session, AssessmentRow, assessment_id))
 
 
 def list_assessments(
@@ -152,11 +130,7 @@ def list_assessments(
     Raises:
         InvalidCursor: no list of assessments gave this cursor out.
     """
-    statement = select(AssessmentRow)
-    if name is not None:
-        statement = statement.where(AssessmentRow.name == name)
-    if version is not None:
-        statement = statement.where(AssessmentRow.version == version)
+    statement = chosen(select(AssessmentRow), (AssessmentRow.name, name), (AssessmentRow.version, version))
     keys = (AssessmentRow.created_at, AssessmentRow.id)
     return page_of(session, statement, keys, _assessment, limit=limit, cursor=cursor)
 
@@ -176,28 +150,11 @@ def mark_assessment_ready(
         NotFound: there is no such assessment.
         Conflict: it is not pending.
     """
-    row = assessment_row(session, assessment_id)
-    if row.state != "pending":
-        raise Conflict(f"assessment {assessment_id} is {row.state}; only a pending one can become ready")
+    row = pending(session, AssessmentRow, assessment_id)
     row.state = "ready"
     row.figures = figures
     row.lineage = lineage.model_dump(mode="json")
     session.flush()
-    return row
-
-
-def end_assessment(session: Session, assessment_id: str, state: Unmade) -> None:
-    """Mark a pending assessment failed or cancelled; a ready one stays as it is."""
-    row = assessment_row(session, assessment_id)
-    if row.state == "pending":
-        row.state = state
-
-
-def assessment_row(session: Session, assessment_id: str) -> AssessmentRow:
-    """The row, or NotFound."""
-    row = session.get(AssessmentRow, assessment_id)
-    if row is None:
-        raise NotFound("assessment", assessment_id)
     return row
 
 

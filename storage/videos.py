@@ -5,18 +5,19 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from physworld_schemas.base import Artifact, Lineage, Page, Unmade
+from physworld_schemas.base import Artifact, Lineage, Page
 from physworld_schemas.scene import Scene
 from physworld_schemas.video import Video, VideoReport
 from physworld_storage import resources
-from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.errors import NotFound
 from physworld_storage.pages import page_of
+from physworld_storage.rows import chosen, pending, plain, required
 from physworld_storage.tables import SceneRow, VideoRow, columns_of
 
 
 def get_video(session: Session, video_id: str) -> Video:
     """The film, or NotFound."""
-    return _video(video_row(session, video_id))
+    return _video(required(session, VideoRow, video_id))
 
 
 def list_videos(
@@ -41,11 +42,8 @@ def list_videos(
     Raises:
         InvalidCursor: no list of films gave this cursor out.
     """
-    statement = select(VideoRow)
-    wanted = ((VideoRow.scene_id, scene_id), (VideoRow.of, of), (VideoRow.source_id, source_id))
-    for column, value in wanted:
-        if value is not None:
-            statement = statement.where(column == value)
+    filters = ((VideoRow.scene_id, scene_id), (VideoRow.of, of), (VideoRow.source_id, source_id))
+    statement = chosen(select(VideoRow), *filters)
     return page_of(session, statement, (VideoRow.created_at, VideoRow.id), _video, limit=limit, cursor=cursor)
 
 
@@ -65,29 +63,12 @@ def mark_video_ready(
         NotFound: there is no such film.
         Conflict: it is not pending.
     """
-    row = video_row(session, video_id)
-    if row.state != "pending":
-        raise Conflict(f"video {video_id} is {row.state}; only a pending one can become ready")
+    row = pending(session, VideoRow, video_id)
     row.state = "ready"
     row.report = report.model_dump(mode="json")
-    row.artifacts = [artifact.model_dump(mode="json") for artifact in artifacts]
+    row.artifacts = plain(artifacts)
     row.lineage = lineage.model_dump(mode="json")
     session.flush()
-
-
-def end_video(session: Session, video_id: str, state: Unmade) -> None:
-    """Mark a pending film failed or cancelled; a ready one stays as it is."""
-    row = video_row(session, video_id)
-    if row.state == "pending":
-        row.state = state
-
-
-def video_row(session: Session, video_id: str) -> VideoRow:
-    """The row, or NotFound."""
-    row = session.get(VideoRow, video_id)
-    if row is None:
-        raise NotFound("video", video_id)
-    return row
 
 
 def put_picture(session: Session, scene_id: str, picture: Artifact) -> Scene:

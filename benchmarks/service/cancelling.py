@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 from physworld_client import Client
 from physworld_client.calls import Call
-from pydantic import TypeAdapter
 
 from benchmarks.harness import Report, run_alone, summarise
 from benchmarks.service.factory import SCENE, service
@@ -142,7 +141,7 @@ def _rollout(client: Client) -> Job:
     still = np.load(SCENE / "scene.npz")["controllers"][0]
     paths = EncodedArray.of(np.broadcast_to(still, (CANDIDATES, TICKS, *still.shape)))
     asked = RolloutCreate(model=MODEL, version=1, controllers=paths, start="rest", mode="job")
-    answer: Job = client.send(Call("POST", "/v1/rollouts", TypeAdapter(Job), body=asked))
+    answer: Job = client.send(Call("POST", "/v1/rollouts", Job, body=asked))
     return answer
 
 

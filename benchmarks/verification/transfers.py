@@ -8,6 +8,7 @@ the second the 0.3 m beam of the design notes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ import warp as wp
 
 from benchmarks.harness import Report, run_alone
 from physworld.engine.lattice.lattice import Lattice, box_lattice
-from physworld.engine.problem import HeldNodes, Problem, Solver
+from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.engine.updated.formulation import UpdatedLagrangian
 from physworld.engine.updated.transfer import Apic, Asflip
@@ -107,13 +108,13 @@ def measure(repeats: int, seed: int) -> Report:
     )
 
 
-def ringing(beam: Beam, make: object) -> dict[str, float]:
+def ringing(beam: Beam, make: Callable[[Problem], TotalLagrangian | UpdatedLagrangian]) -> dict[str, float]:
     """Rate of loss, frequency and droop of the tip."""
     lattice = beam.lattice
     rest, times = lattice.node_coordinates, np.arange(0.0, beam.seconds, FRAME_S)
     gripped = np.unique(lattice.cell_nodes[lattice.cells[:, 0] == 0])
     paths = np.repeat(rest[gripped][None], len(times), axis=0)
-    engine: Solver = make(Problem(lattice, beam.law, rest, GRAVITY))  # type: ignore[operator]
+    engine = make(Problem(lattice, beam.law, rest, GRAVITY))
     nodes = engine.run(rest, np.zeros_like(rest), HeldNodes(gripped, paths, np.zeros_like(paths)), times)
     row = lattice.interpolation(np.array([[beam.length_m, beam.side_m / 2, beam.side_m / 2]]))
     tip = np.array([(row @ frame)[0, 2] for frame in nodes]) - beam.side_m / 2

@@ -36,17 +36,21 @@ _DECLARED = {"self_contact": "the body touches itself", "topology_change": "the 
 
 
 @dataclass(frozen=True)
-class Start:
-    """The first frame of a run.
+class Course:
+    """How a run begins, what holds the body, and when its carriers are asked for.
 
     Attributes:
-        nodes, velocities: of the lattice, (n, 3) [m] and [m/s].
-        particles: all particles, those without material too, (P, 3) [m].
+        nodes, velocities: of the lattice at the first time, (n, 3) [m] and [m/s].
+        particles: all particles there, those without material too, (P, 3) [m].
+        held: prescribed nodes; their paths are given at ``times``.
+        times: (T,) [s], strictly increasing.
     """
 
     nodes: Array
     velocities: Array
     particles: Array
+    held: HeldNodes
+    times: Array
 
 
 class Formulation(ABC):
@@ -99,17 +103,10 @@ class Formulation(ABC):
         """
 
     @abstractmethod
-    def run(
-        self, solver: Any, start: Start, held: HeldNodes, times: Array, progress: Progress | None = None
-    ) -> Array:
-        """Carriers at ``times``, (T, n, 3) [m].
+    def run(self, solver: Any, course: Course, progress: Progress | None = None) -> Array:
+        """Carriers at the course's times, (T, n, 3) [m], by what :meth:`solver` made.
 
-        Args:
-            solver: of :meth:`solver`.
-            start: state at the first time.
-            held: prescribed nodes; their paths are given at ``times``.
-            times: (T,) [s], strictly increasing.
-            progress: called with (frames done, frames in all) once a frame; may raise to stop.
+        ``progress`` is called with (frames done, frames in all) once a frame, and may raise to stop.
 
         Raises:
             SimulationError: the run cannot be trusted.
@@ -117,13 +114,9 @@ class Formulation(ABC):
 
     @abstractmethod
     def run_with_ledger(
-        self, solver: Any, start: Start, held: HeldNodes, times: Array, progress: Progress | None = None
+        self, solver: Any, course: Course, progress: Progress | None = None
     ) -> tuple[Array, EnergyLedger | ParticleLedger]:
-        """The same, and where every joule went; errors are those of :meth:`run`.
-
-        Args:
-            solver, start, held, times, progress: as in :meth:`run`.
-        """
+        """The same, and where every joule went; errors are those of :meth:`run`."""
 
 
 class TotalForm(Formulation):
@@ -156,36 +149,18 @@ class TotalForm(Formulation):
         """
         return TotalLagrangian(problem, time_step_s)
 
-    def run(
-        self,
-        solver: TotalLagrangian,
-        start: Start,
-        held: HeldNodes,
-        times: Array,
-        progress: Progress | None = None,
-    ) -> Array:
-        """Nodes; once more at half the time step where the body blew up.
-
-        Args:
-            solver, start, held, times, progress: as in :meth:`Formulation.run`.
-        """
-        return run_again_if_blown_up(solver, start.nodes, start.velocities, held, times, progress)
+    def run(self, solver: TotalLagrangian, course: Course, progress: Progress | None = None) -> Array:
+        """Nodes; once more at half the time step where the body blew up."""
+        return run_again_if_blown_up(
+            solver, course.nodes, course.velocities, course.held, course.times, progress
+        )
 
     def run_with_ledger(
-        self,
-        solver: TotalLagrangian,
-        start: Start,
-        held: HeldNodes,
-        times: Array,
-        progress: Progress | None = None,
+        self, solver: TotalLagrangian, course: Course, progress: Progress | None = None
     ) -> tuple[Array, EnergyLedger]:
-        """Nodes and the ledger of the nodes.
-
-        Args:
-            solver, start, held, times, progress: as in :meth:`Formulation.run_with_ledger`.
-        """
+        """Nodes and the ledger of the nodes."""
         return run_with_ledger(
-            solver.problem, start.nodes, start.velocities, held, times,
+            solver.problem, course.nodes, course.velocities, course.held, course.times,
             time_step_s=solver.asked_step_s, progress=progress,
         )  # fmt: skip
 
@@ -219,39 +194,19 @@ class UpdatedForm(Formulation):
         """
         return UpdatedLagrangian(problem, time_step_s, transfer=TRANSFERS[transfer](), plasticity=plasticity)
 
-    def run(
-        self,
-        solver: UpdatedLagrangian,
-        start: Start,
-        held: HeldNodes,
-        times: Array,
-        progress: Progress | None = None,
-    ) -> Array:
-        """All particles.
-
-        Args:
-            solver, start, held, times, progress: as in :meth:`Formulation.run`.
-        """
-        solid = solver.run_particles(start.nodes, start.velocities, held, times, progress)
-        return _with_empty(solver.solid, solid, start.particles)
+    def run(self, solver: UpdatedLagrangian, course: Course, progress: Progress | None = None) -> Array:
+        """All particles."""
+        solid = solver.run_particles(course.nodes, course.velocities, course.held, course.times, progress)
+        return _with_empty(solver.solid, solid, course.particles)
 
     def run_with_ledger(
-        self,
-        solver: UpdatedLagrangian,
-        start: Start,
-        held: HeldNodes,
-        times: Array,
-        progress: Progress | None = None,
+        self, solver: UpdatedLagrangian, course: Course, progress: Progress | None = None
     ) -> tuple[Array, ParticleLedger]:
-        """All particles and their ledger.
-
-        Args:
-            solver, start, held, times, progress: as in :meth:`Formulation.run_with_ledger`.
-        """
+        """All particles and their ledger."""
         solid, ledger = run_particles_with_ledger(
-            solver, start.nodes, start.velocities, held, times, progress
+            solver, course.nodes, course.velocities, course.held, course.times, progress
         )
-        return _with_empty(solver.solid, solid, start.particles), ledger
+        return _with_empty(solver.solid, solid, course.particles), ledger
 
 
 def _with_empty(numbers: Array, solid: Array, start: Array) -> Array:
@@ -297,36 +252,17 @@ class RodForm(Formulation):
         """
         return DiscreteRods([problem], time_step_s)
 
-    def run(
-        self,
-        solver: DiscreteRods,
-        start: Start,
-        held: HeldNodes,
-        times: Array,
-        progress: Progress | None = None,
-    ) -> Array:
-        """Nodes.
-
-        Args:
-            solver, start, held, times, progress: as in :meth:`Formulation.run`.
-        """
-        found = solver.run(start.nodes, start.velocities, [held], times, progress)[0]
+    def run(self, solver: DiscreteRods, course: Course, progress: Progress | None = None) -> Array:
+        """Nodes."""
+        found = solver.run(course.nodes, course.velocities, [course.held], course.times, progress)[0]
         if isinstance(found, SimulationError):
             raise found
         return found
 
     def run_with_ledger(
-        self,
-        solver: DiscreteRods,
-        start: Start,
-        held: HeldNodes,
-        times: Array,
-        progress: Progress | None = None,
+        self, solver: DiscreteRods, course: Course, progress: Progress | None = None
     ) -> tuple[Array, EnergyLedger]:
         """None is kept.
-
-        Args:
-            solver, start, held, times, progress: as in :meth:`Formulation.run_with_ledger`.
 
         Raises:
             SceneUnsupported: always.

@@ -1,10 +1,9 @@
-"""What a formulation integrates, and what it promises: what both formulations make of it."""
+"""What a formulation integrates."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from physworld.arrays import Array
 from physworld.devices import default_device
@@ -60,30 +59,6 @@ class Problem:
         """Lumped nodal masses [kg], (n,)."""
         mass = nodal_mass(self.lattice, self.law, self.density_factor)
         return mass if self.added_mass is None else mass + self.added_mass
-
-
-class Solver(Protocol):
-    """A :class:`Problem` with a time step: what a formulation makes of it."""
-
-    time_step_s: float
-
-    def run(
-        self,
-        x: Array,
-        v: Array,
-        held: HeldNodes,
-        times: Array,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> Array:
-        """Nodal positions at ``times``, (T, n, 3) [m].
-
-        Args:
-            x, v: nodal positions [m] and velocities [m/s] at the first time, (n, 3).
-            held: prescribed nodes; their paths are given at ``times``.
-            times: (T,) [s], strictly increasing.
-            progress: called with (frames done, frames in all) once a frame; may raise to stop.
-        """
-        ...
 
 
 def nodal_mass(lattice: Lattice, law: Law, density_factor: Array | None) -> Array:

@@ -351,8 +351,8 @@ def _run_with_ledger(
     poll: Poll | None = None,
 ) -> tuple[Array, EnergyLedger | ParticleLedger, float]:
     """Carriers at the frames (T, n, 3), the ledger at the knots, and the largest time step [s]."""
-    solver, start = twin.solver(run.problem, time_step_s), twin.start_of(velocity)
-    carriers, ledger = twin.form.run_with_ledger(solver, start, run.held, run.knots, poll)
+    solver = twin.solver(run.problem, time_step_s)
+    carriers, ledger = twin.form.run_with_ledger(solver, twin.course(run, velocity), poll)
     return run.at_frames(twin.carriers_start, carriers), ledger, solver.time_step_s
 
 

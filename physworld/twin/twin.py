@@ -22,7 +22,7 @@ from physworld.arrays import Array
 from physworld.devices import default_device
 from physworld.effects.base import Effect
 from physworld.effects.registry import in_order
-from physworld.engine.formulations import FORMULATIONS, Formulation, Start
+from physworld.engine.formulations import FORMULATIONS, Course, Formulation
 from physworld.engine.lattice.following import follow
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.problem import Problem
@@ -255,12 +255,12 @@ class Twin:
 
     def carriers(self, solver: Any, run: Integration, progress: Progress | None = None) -> Array:
         """Carriers (T, n, 3) [m] at the frames of a run that a solver of this twin integrates. May raise."""
-        carriers = self.form.run(solver, self.start_of(run.velocity), run.held, run.knots, progress)
+        carriers = self.form.run(solver, self.course(run, run.velocity), progress)
         return run.at_frames(self.carriers_start, carriers)
 
-    def start_of(self, velocity: Array) -> Start:
-        """The first frame with nodal velocities (n, 3) [m/s]."""
-        return Start(self.body.start, velocity, self.particles_start)
+    def course(self, run: Integration, velocity: Array) -> Course:
+        """A run from the first frame on, with nodal velocities (n, 3) [m/s] there."""
+        return Course(self.body.start, velocity, self.particles_start, run.held, run.knots)
 
     @property
     def carriers_start(self) -> Array:

@@ -27,7 +27,7 @@ from physworld_schemas.trace import TraceCreate
 from physworld_schemas.tracking import TrackingOptions
 from physworld_schemas.video import VideoCreate
 from physworld_storage.changes import announce
-from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.errors import Conflict
 from physworld_storage.jobs.events import append_event
 from physworld_storage.jobs.flow import request_cancel
 from physworld_storage.jobs.helpers import SIMULATION
@@ -48,6 +48,7 @@ from physworld_storage.jobs.kinds import (
 )
 from physworld_storage.jobs.shards import CANCELLED, FAILED, QUEUED, lock_job
 from physworld_storage.pages import page_of
+from physworld_storage.rows import chosen, required
 from physworld_storage.runs import RunKind
 from physworld_storage.tables import JobRow, ShardRow, columns_of, utc_now
 
@@ -153,10 +154,7 @@ def create_run(
 
 def get_job(session: Session, job_id: str) -> Job:
     """The job, or NotFound."""
-    row = session.get(JobRow, job_id)
-    if row is None:
-        raise NotFound("job", job_id)
-    return _job(session, row)
+    return _job(session, required(session, JobRow, job_id))
 
 
 def states_of(session: Session, job_ids: Sequence[str]) -> dict[str, str]:
@@ -185,9 +183,8 @@ def list_jobs(
         parent_id: only children of this job.
     """
     statement = select(JobRow)
-    for column, wanted in ((JobRow.state, state), (JobRow.kind, kind), (JobRow.parent_id, parent_id)):
-        if wanted is not None:
-            statement = statement.where(column == wanted)
+    filters = ((JobRow.state, state), (JobRow.kind, kind), (JobRow.parent_id, parent_id))
+    statement = chosen(statement, *filters)
     keys = (JobRow.created_at, JobRow.id)
     return page_of(session, statement, keys, lambda row: _job(session, row), limit=limit, cursor=cursor)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from pydantic import Field
 from sqlalchemy.orm import Session
@@ -22,10 +22,10 @@ from physworld_schemas.base import Lineage, Reference, Resource, Unmade
 from physworld_schemas.ids import new_id
 from physworld_schemas.job import Job, Progress
 from physworld_schemas.job import JobKind as Name
-from physworld_storage.errors import NotFound
 from physworld_storage.jobs.events import append_event
 from physworld_storage.jobs.shards import Stage, put_up
-from physworld_storage.tables import JobRow, SceneRow, ShardRow, utc_now
+from physworld_storage.rows import end_pending, required
+from physworld_storage.tables import JobRow, Made, ShardRow, utc_now
 
 
 class ShardResult(Resource):
@@ -86,6 +86,7 @@ class JobKind:
         unit: what a job's progress counts.
         shards: the kinds of its shards, in the order of its stages; helpers last.
         makes: the kind of what it brings forth.
+        table: of what it brings forth, where that has a row of its own under the id of the job's output.
         has_children: whether it consists of other jobs instead of shards.
         decisive: settings without which two such jobs go other ways, so that one says nothing of the other's time.
     """
@@ -93,6 +94,7 @@ class JobKind:
     name: Name
     unit: str
     shards: tuple[ShardKind[Any], ...] = ()
+    table: ClassVar[type[Made]]
     has_children = False
     decisive: tuple[str, ...] = ()
 
@@ -110,11 +112,11 @@ class JobKind:
             state: what it is from now on.
             message: why it failed, for people.
         """
-        raise NotImplementedError
+        end_pending(session, self.table, output_of(job), state)
 
     def reopen(self, session: Session, job: JobRow) -> None:
         """Mark what a failed job should have brought forth pending again."""
-        raise NotImplementedError
+        required(session, self.table, output_of(job)).state = "pending"
 
     def subject(self, job: Job) -> str | None:
         """What the job is about, where that is not the scene that it was made from."""
@@ -217,14 +219,6 @@ def output_of(job: JobRow) -> str:
 def share_of(job: JobRow) -> float:
     """How much of a stored job is done, 0 to 1."""
     return 1.0 if job.state == "succeeded" else Progress.model_validate(job.progress).share
-
-
-def scene_row(session: Session, scene_id: str) -> SceneRow:
-    """The scene, or NotFound."""
-    scene = session.get(SceneRow, scene_id)
-    if scene is None:
-        raise NotFound("scene", scene_id)
-    return scene
 
 
 def pending_lineage(job: JobRow) -> dict[str, Any]:

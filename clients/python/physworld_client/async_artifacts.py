@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import httpx
 
-from physworld_client import calls, transport
+from physworld_client import transport
+from physworld_client.calls import route
 from physworld_client.partial import PartialFile
 from physworld_client.progress import Bar
 from physworld_schemas.base import Artifact
@@ -65,7 +66,7 @@ class AsyncArtifacts:
 
     async def _fetch(self, partial: PartialFile, bar: Bar) -> httpx.Response:
         """One request for what is missing; the body of a success is in the part when this returns."""
-        path = calls.artifact_path(partial.sha256)
+        path = route("artifacts", partial.sha256)
         async with self._client.http.stream("GET", path, headers=partial.headers()) as response:
             if response.is_success:
                 partial.accept(response)

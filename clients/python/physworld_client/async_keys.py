@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from physworld_client import calls
 from physworld_client.async_base import AsyncListed
 from physworld_client.pages import AsyncListPage
 from physworld_client.types import ApiKey
-from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, Role
+from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, KeyCreate, KeyRotate, Role
 
 
 class AsyncKeys(AsyncListed):
@@ -24,16 +23,18 @@ class AsyncKeys(AsyncListed):
             role: "read", "write", or "admin", which may manage keys too.
             expires_in_days: its term; None: it never ends.
         """
-        return await self._client.send(calls.key_create(name, role, expires_in_days))
+        body = KeyCreate(name=name, role=role, expires_in_days=expires_in_days)
+        return await self._send("POST", ApiKey, "keys", body=body)
 
     async def list(self, *, limit: int | None = None, cursor: str | None = None) -> AsyncListPage[ApiKey]:
         """Keys, newest first, the revoked and expired ones too."""
-        return await self._page(lambda at: calls.key_list(limit=limit, cursor=at), cursor)
+        return await self._page(ApiKey, "keys", cursor=cursor, limit=limit)
 
     async def rotate(self, key_id: str, *, grace_minutes: int | None = None) -> ApiKey:
         """Gives a key another token and its whole term again; the old token stays good for the grace."""
-        return await self._client.send(calls.key_rotate(await self.id_of(key_id), grace_minutes))
+        body = KeyRotate() if grace_minutes is None else KeyRotate(grace_minutes=grace_minutes)
+        return await self._send("POST", ApiKey, "keys", await self.id_of(key_id), "rotate", body=body)
 
     async def revoke(self, key_id: str) -> ApiKey:
         """Ends a key, and what it opened, at once."""
-        return await self._client.send(calls.key_revoke(await self.id_of(key_id)))
+        return await self._send("DELETE", ApiKey, "keys", await self.id_of(key_id))

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from physworld_client import calls
 from physworld_client.arrays import arrays_of
 from physworld_client.async_base import AsyncListed
 from physworld_client.async_resources import LATEST
 from physworld_client.pages import AsyncListPage
 from physworld_client.types import Array, Assessment, Check, Job, Loop, Trace
 from physworld_schemas.assessment import AssessmentCreate, Frames
-from physworld_schemas.check import CheckConfig
+from physworld_schemas.check import CheckConfig, CheckCreate
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import TrainingConfig
-from physworld_schemas.trace import TraceConfig
+from physworld_schemas.trace import TraceConfig, TraceCreate
 
 
 class AsyncChecks(AsyncListed):
@@ -27,18 +26,19 @@ class AsyncChecks(AsyncListed):
     async def create(self, scene_id: str, config: CheckConfig | None = None) -> Job:
         """Starts a check; its job's output is the check."""
         scene = await self._client.scenes.id_of(scene_id)
-        return await self._client.send(calls.check_create(scene, config))
+        body = CheckCreate(scene_id=scene, config=config or CheckConfig())
+        return await self._send("POST", Job, "checks", body=body)
 
     async def get(self, check_id: str) -> Check:
         """One check: once it is ready, its report."""
-        return await self._client.send(calls.check_get(await self.id_of(check_id)))
+        return await self._send("GET", Check, "checks", await self.id_of(check_id))
 
     async def list(
         self, *, limit: int | None = None, cursor: str | None = None, scene_id: str | None = None
     ) -> AsyncListPage[Check]:
         """Checks, newest first."""
         scene = None if scene_id is None else await self._client.scenes.id_of(scene_id)
-        return await self._page(lambda at: calls.check_list(limit=limit, cursor=at, scene_id=scene), cursor)
+        return await self._page(Check, "checks", cursor=cursor, limit=limit, scene_id=scene)
 
 
 class AsyncTraces(AsyncListed):
@@ -67,15 +67,20 @@ class AsyncTraces(AsyncListed):
             held_out_scene_ids: recordings that only the report sees.
         """
         scenes = self._client.scenes
-        first = await scenes.id_of(scene_id)
-        further = [await scenes.id_of(one) for one in scene_ids]
-        held_out = [await scenes.id_of(one) for one in held_out_scene_ids]
-        twin = None if fit_id is None else await self._client.fits.id_of(fit_id)
-        return await self._client.send(calls.trace_create(first, config, fit, twin, further, held_out))
+        body = TraceCreate(
+            scene_id=await scenes.id_of(scene_id),
+            scene_ids=[await scenes.id_of(one) for one in scene_ids],
+            held_out_scene_ids=[await scenes.id_of(one) for one in held_out_scene_ids],
+            fit_id=None if fit_id is None else await self._client.fits.id_of(fit_id),
+            config=config or TraceConfig(),
+        )
+        if fit is not None:
+            body = body.model_copy(update={"fit": fit})
+        return await self._send("POST", Job, "traces", body=body)
 
     async def get(self, trace_id: str) -> Trace:
         """One trace: the verdict and every figure of its report."""
-        return await self._client.send(calls.trace_get(await self.id_of(trace_id)))
+        return await self._send("GET", Trace, "traces", await self.id_of(trace_id))
 
     async def list(
         self,
@@ -94,18 +99,16 @@ class AsyncTraces(AsyncListed):
             verdict: only those with this verdict.
         """
         scene = None if scene_id is None else await self._client.scenes.id_of(scene_id)
-        return await self._page(
-            lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene, verdict=verdict), cursor
-        )
+        return await self._page(Trace, "traces", cursor=cursor, limit=limit, scene_id=scene, verdict=verdict)
 
     async def tracks(self, trace_id: str) -> dict[str, Array]:
         """``times`` (T,) [s], ``before`` and ``after`` (T, N, 3) [m]: open-loop tracks without and with the effects."""
-        return arrays_of(await self._client.send(calls.trace_tracks(await self.id_of(trace_id))))
+        return arrays_of(await self._send("GET", bytes, "traces", await self.id_of(trace_id), "tracks"))
 
     async def cancel(self, trace_id: str) -> Job:
         """Asks for the end of the trace's job."""
         trace = await self.get(trace_id)
-        return await self._client.send(calls.job_cancel(trace.job_id))
+        return await self._send("POST", Job, "jobs", trace.job_id, "cancel")
 
 
 class AsyncAssessments(AsyncListed):
@@ -142,11 +145,11 @@ class AsyncAssessments(AsyncListed):
             frames=frames,
             compared_with=compared_with,
         )
-        return await self._client.send(calls.assessment_create(name, version, body))
+        return await self._send("POST", Job, "models", name, "versions", version, "assessments", body=body)
 
     async def get(self, assessment_id: str) -> Assessment:
         """One assessment."""
-        return await self._client.send(calls.assessment_get(await self.id_of(assessment_id)))
+        return await self._send("GET", Assessment, "assessments", await self.id_of(assessment_id))
 
     async def list(
         self,
@@ -167,9 +170,10 @@ class AsyncAssessments(AsyncListed):
         """
         if version is not None and name is None:
             raise ValueError(f"version {version} of which model? Give its name too")
-        return await self._page(
-            lambda at: calls.assessment_list(name, version, limit=limit, cursor=at), cursor
-        )
+        if name is None or version is None:
+            return await self._page(Assessment, "assessments", cursor=cursor, limit=limit, model=name)
+        places = ("models", name, "versions", version, "assessments")
+        return await self._page(Assessment, *places, cursor=cursor, limit=limit)
 
 
 class AsyncLoops(AsyncListed):
@@ -210,11 +214,11 @@ class AsyncLoops(AsyncListed):
             dataset=dataset,
             training=training,
         )
-        return await self._client.send(calls.loop_create(body))
+        return await self._send("POST", Job, "loops", body=body)
 
     async def get(self, loop_id: str) -> Loop:
         """One loop: how it ended, what it made, and the errors of both versions."""
-        return await self._client.send(calls.loop_get(await self.id_of(loop_id)))
+        return await self._send("GET", Loop, "loops", await self.id_of(loop_id))
 
     async def list(
         self,
@@ -232,6 +236,4 @@ class AsyncLoops(AsyncListed):
             model: only those of the model with this name.
             state: only those whose job is in this state.
         """
-        return await self._page(
-            lambda at: calls.loop_list(limit=limit, cursor=at, model=model, state=state), cursor
-        )
+        return await self._page(Loop, "loops", cursor=cursor, limit=limit, model=model, state=state)

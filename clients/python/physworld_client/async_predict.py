@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
 
 from physworld_client import predictions
 from physworld_client.async_base import AsyncListed
 from physworld_client.async_resources import LATEST
+from physworld_client.calls import Call, route
 from physworld_client.pages import AsyncListPage
 from physworld_client.predictions import Planned, Predicted
 from physworld_client.types import Array, Job, Plan, Rollout
-from physworld_schemas.plan import PlanConfig, PlanLimits
-from physworld_schemas.rollout import Part, Start
+from physworld_schemas.arrays import EncodedArray
+from physworld_schemas.plan import PlanConfig, PlanCreate, PlanLimits
+from physworld_schemas.rollout import Part, RolloutCreate, Start
+
+ANSWER_S = 60.0
+"""Seconds that the service may work on a rollout before it answers."""
 
 
 class AsyncRollouts(AsyncListed):
@@ -51,22 +59,23 @@ class AsyncRollouts(AsyncListed):
             as_job: queue it, however small.
             timeout: seconds to wait for a job.
         """
-        answer = await self._client.send(
-            predictions.rollout_create(
-                model,
-                controllers,
-                version,
-                times,
-                dt_s,
-                start,
-                phi,
-                stiffness_factor,
-                density_factor,
-                returns,
-                every,
-                as_job,
-            )
+        body = RolloutCreate(
+            model=model,
+            version=version,
+            controllers=EncodedArray.of(np.asarray(controllers)),
+            start=start,
+            stiffness_factor=stiffness_factor,
+            density_factor=density_factor,
+            returns=list(returns),
+            every=every,
+            mode="job" if as_job else "auto",
+            times=None if times is None else np.asarray(times, dtype=np.float64).tolist(),
+            dt_s=dt_s,
+            phi=None if phi is None else EncodedArray.of(np.asarray(phi)),
         )
+        either = cast("type[Rollout | Job]", Rollout | Job)
+        call = Call("POST", route("rollouts"), either, body=body, read_timeout_s=ANSWER_S)
+        answer = await self._client.send(call)
         if isinstance(answer, Rollout):
             return predictions.predicted(answer)
         job = await self._client.jobs.wait(answer, timeout)
@@ -74,7 +83,7 @@ class AsyncRollouts(AsyncListed):
 
     async def get(self, rollout_id: str) -> Rollout:
         """A rollout that was a job."""
-        return await self._client.send(predictions.rollout_get(await self.id_of(rollout_id)))
+        return await self._send("GET", Rollout, "rollouts", await self.id_of(rollout_id))
 
     async def result(self, rollout_id: str) -> Predicted:
         """The arrays of a rollout that was a job."""
@@ -88,9 +97,7 @@ class AsyncRollouts(AsyncListed):
         self, *, limit: int | None = None, cursor: str | None = None, model: str | None = None
     ) -> AsyncListPage[Rollout]:
         """Rollouts that were jobs, newest first."""
-        return await self._page(
-            lambda at: predictions.rollout_list(limit=limit, cursor=at, model=model), cursor
-        )
+        return await self._page(Rollout, "rollouts", cursor=cursor, limit=limit, model=model)
 
 
 class AsyncPlans(AsyncListed):
@@ -116,11 +123,18 @@ class AsyncPlans(AsyncListed):
             limits: of speed, acceleration, workspace; by default the recording's.
             config: horizon, samples, iterations, seed.
         """
-        return await self._client.send(predictions.plan_create(model, version, points, shape, limits, config))
+        body = PlanCreate(
+            model=model,
+            version=version,
+            goal=predictions.goal_of(points, shape),
+            limits=limits or PlanLimits(),
+            config=config or PlanConfig(),
+        )
+        return await self._send("POST", Job, "plans", body=body)
 
     async def get(self, plan_id: str) -> Plan:
         """One plan: errors of the prediction and of its execution in the twin."""
-        return await self._client.send(predictions.plan_get(await self.id_of(plan_id)))
+        return await self._send("GET", Plan, "plans", await self.id_of(plan_id))
 
     async def result(self, plan_id: str) -> Planned:
         """A plan with its arrays: control path, predicted and executed paths."""
@@ -132,4 +146,4 @@ class AsyncPlans(AsyncListed):
         self, *, limit: int | None = None, cursor: str | None = None, model: str | None = None
     ) -> AsyncListPage[Plan]:
         """Plans, newest first."""
-        return await self._page(lambda at: predictions.plan_list(limit=limit, cursor=at, model=model), cursor)
+        return await self._page(Plan, "plans", cursor=cursor, limit=limit, model=model)

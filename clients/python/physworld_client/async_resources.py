@@ -9,10 +9,11 @@ from pathlib import Path
 
 import httpx
 
-from physworld_client import calls, transport
+from physworld_client import transport
 from physworld_client.arrays import arrays_of
 from physworld_client.async_base import AsyncListed, AsyncResource
 from physworld_client.bundle import open_bundle, open_pictures
+from physworld_client.calls import Call, given, page_of, route
 from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.export import open_export
 from physworld_client.known_keys import is_fingerprint, trusted_keys
@@ -35,12 +36,12 @@ from physworld_client.types import (
     SigningKey,
 )
 from physworld_client.waiting import Patience, job_id_of, require_success
-from physworld_schemas.dataset import DatasetConfig
-from physworld_schemas.fit import FitConfig
+from physworld_schemas.dataset import DatasetConfig, DatasetCreate
+from physworld_schemas.fit import FitConfig, FitCreate
 from physworld_schemas.job import TERMINAL_STATES
-from physworld_schemas.model import TrainingConfig
+from physworld_schemas.model import AliasSet, TrainingConfig, TrainingCreate, VersionPatch
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_schemas.scene import SceneImport
+from physworld_schemas.scene import SceneImport, ScenePatch
 from physworld_schemas.tracking import TrackingOptions, TrackingPreview
 
 LATEST = "latest"
@@ -59,20 +60,23 @@ class AsyncScenes(AsyncListed):
             options: what a foreign recording does not say of itself.
         """
         with open_bundle(path) as upload, self._client.bars.sending(upload) as sent:
-            return await self._client.send(calls.scene_create(sent, options))
+            call = Call("POST", route("scenes"), Scene, upload=sent, form=_form(options))
+            return await self._client.send(call)
 
     async def preview(self, path: str | Path, options: SceneImport | None = None) -> ScenePreview:
         """What an import of a recording would guess: axes, unit, rate, gripper, noise. Nothing is stored."""
         with open_bundle(path) as upload, self._client.bars.sending(upload) as sent:
-            return await self._client.send(calls.scene_preview(sent, options))
+            call = Call("POST", route("scenes", "preview"), ScenePreview, upload=sent, form=_form(options))
+            return await self._client.send(call)
 
     async def get(self, scene_id: str) -> Scene:
         """One scene."""
-        return await self._client.send(calls.scene_get(await self.id_of(scene_id)))
+        return await self._send("GET", Scene, "scenes", await self.id_of(scene_id))
 
     async def update(self, scene_id: str, *, tags: tuple[str, ...]) -> Scene:
         """Gives a scene these tags, in the place of those before. The recording itself never changes."""
-        return await self._client.send(calls.scene_patch(await self.id_of(scene_id), tags))
+        body = ScenePatch(tags=[*tags])
+        return await self._send("PATCH", Scene, "scenes", await self.id_of(scene_id), body=body)
 
     async def list(
         self,
@@ -90,9 +94,12 @@ class AsyncScenes(AsyncListed):
             kind: only those of this kind.
             tag: only those with this tag.
         """
-        return await self._page(
-            lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind, tag=tag), cursor
-        )
+        return await self._page(Scene, "scenes", cursor=cursor, limit=limit, kind=kind, tag=tag)
+
+
+def _form(options: SceneImport | TrackingOptions | None) -> dict[str, str]:
+    """What stands beside an upload."""
+    return {} if options is None else {"options": options.model_dump_json(exclude_unset=True)}
 
 
 class AsyncTrackings(AsyncResource):
@@ -112,12 +119,14 @@ class AsyncTrackings(AsyncResource):
             files: further files by the names that the options give them: masks, tracks, a robot's log, a camera.
         """
         with open_pictures(path, files) as upload, self._client.bars.sending(upload) as sent:
-            return await self._client.send(calls.tracking_create(sent, options))
+            call = Call("POST", route("trackings"), Job, upload=sent, form=_form(options))
+            return await self._client.send(call)
 
     async def preview(self, path: str | Path) -> TrackingPreview:
         """The first picture of each camera, in whose pixels the options speak. Nothing is stored."""
         with open_pictures(path) as upload, self._client.bars.sending(upload) as sent:
-            return await self._client.send(calls.tracking_preview(sent))
+            call = Call("POST", route("trackings", "preview"), TrackingPreview, upload=sent)
+            return await self._client.send(call)
 
 
 class AsyncFits(AsyncListed):
@@ -131,17 +140,18 @@ class AsyncFits(AsyncListed):
         """Starts a fit; its job's output is the fit. ``scene_ids``: further recordings of the object, fitted too."""
         scene = await self._client.scenes.id_of(scene_id)
         further = [await self._client.scenes.id_of(one) for one in scene_ids]
-        return await self._client.send(calls.fit_create(scene, config, further))
+        body = FitCreate(scene_id=scene, scene_ids=further, config=config or FitConfig())
+        return await self._send("POST", Job, "fits", body=body)
 
     async def get(self, fit_id: str) -> Fit:
         """One fit."""
-        return await self._client.send(calls.fit_get(await self.id_of(fit_id)))
+        return await self._send("GET", Fit, "fits", await self.id_of(fit_id))
 
     async def list(
         self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
     ) -> AsyncListPage[Fit]:
         """Fits, newest first."""
-        return await self._page(lambda at: calls.fit_list(limit=limit, cursor=at, state=state), cursor)
+        return await self._page(Fit, "fits", cursor=cursor, limit=limit, state=state)
 
 
 class AsyncDatasets(AsyncListed):
@@ -155,24 +165,25 @@ class AsyncDatasets(AsyncListed):
         """Starts writing a dataset, in the twin that the trace made where it added an effect."""
         fit = await self._client.fits.id_of(fit_id)
         trace = None if trace_id is None else await self._client.traces.id_of(trace_id)
-        return await self._client.send(calls.dataset_create(fit, config, trace))
+        body = DatasetCreate(fit_id=fit, trace_id=trace, config=config or DatasetConfig())
+        return await self._send("POST", Job, "datasets", body=body)
 
     async def get(self, dataset_id: str) -> Dataset:
         """One dataset."""
-        return await self._client.send(calls.dataset_get(await self.id_of(dataset_id)))
+        return await self._send("GET", Dataset, "datasets", await self.id_of(dataset_id))
 
     async def list(
         self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
     ) -> AsyncListPage[Dataset]:
         """Datasets, newest first."""
-        return await self._page(lambda at: calls.dataset_list(limit=limit, cursor=at, state=state), cursor)
+        return await self._page(Dataset, "datasets", cursor=cursor, limit=limit, state=state)
 
     async def episodes(
         self, dataset_id: str, *, limit: int | None = None, cursor: str | None = None
     ) -> AsyncListPage[Episode]:
         """The committed episodes of a dataset."""
         dataset = await self.id_of(dataset_id)
-        return await self._page(lambda at: calls.dataset_episodes(dataset, limit=limit, cursor=at), cursor)
+        return await self._page(Episode, "datasets", dataset, "episodes", cursor=cursor, limit=limit)
 
     async def episode(self, dataset_id: str, index: int) -> dict[str, Array]:
         """The arrays of one committed episode.
@@ -185,7 +196,7 @@ class AsyncDatasets(AsyncListed):
             NotFound: no such episode is committed.
         """
         dataset = await self.id_of(dataset_id)
-        return arrays_of(await self._client.send(calls.dataset_episode(dataset, index)))
+        return arrays_of(await self._send("GET", bytes, "datasets", dataset, "episodes", index))
 
     async def export(
         self,
@@ -244,33 +255,41 @@ class AsyncModels(AsyncListed):
             tags: of the version.
         """
         dataset = await self._client.datasets.id_of(dataset_id)
-        return await self._client.send(calls.training_create(name, dataset, config, description, [*tags]))
+        body = TrainingCreate(
+            name=name,
+            dataset_id=dataset,
+            config=config or TrainingConfig(),
+            description=description,
+            tags=[*tags],
+        )
+        return await self._send("POST", Job, "models", body=body)
 
     async def get(self, name: str) -> Model:
         """One registered name with its newest version and aliases."""
-        return await self._client.send(calls.model_get(name))
+        return await self._send("GET", Model, "models", name)
 
     async def list(self, *, limit: int | None = None, cursor: str | None = None) -> AsyncListPage[Model]:
         """Registered names."""
-        return await self._page(lambda at: calls.model_list(limit=limit, cursor=at), cursor)
+        return await self._page(Model, "models", cursor=cursor, limit=limit)
 
     async def versions(
         self, name: str, *, limit: int | None = None, cursor: str | None = None
     ) -> AsyncListPage[ModelVersion]:
         """Versions of a name, newest first."""
-        return await self._page(lambda at: calls.version_list(name, limit=limit, cursor=at), cursor)
+        return await self._page(ModelVersion, "models", name, "versions", cursor=cursor, limit=limit)
 
     async def version(self, name: str, version: int | str = LATEST) -> ModelVersion:
         """One version: by its number, by an alias, or the newest that is ready."""
-        return await self._client.send(calls.version_get(name, version))
+        return await self._send("GET", ModelVersion, "models", name, "versions", version)
 
     async def set_alias(self, name: str, alias: str, version: int) -> Model:
         """Moves an alias to a version."""
-        return await self._client.send(calls.alias_set(name, alias, version))
+        body = AliasSet(version=version)
+        return await self._send("PUT", Model, "models", name, "aliases", alias, body=body)
 
     async def delete_alias(self, name: str, alias: str) -> Model:
         """Removes an alias; the version stays."""
-        return await self._client.send(calls.alias_delete(name, alias))
+        return await self._send("DELETE", Model, "models", name, "aliases", alias)
 
     async def update(
         self,
@@ -288,16 +307,20 @@ class AsyncModels(AsyncListed):
             description: the new one; None: as it is.
             tags: the new ones; None: as they are.
         """
-        return await self._client.send(calls.version_patch(name, version, description, tags))
+        body = VersionPatch(description=description, tags=None if tags is None else [*tags])
+        return await self._send("PATCH", ModelVersion, "models", name, "versions", version, body=body)
 
     async def compare(self, name: str, a: int | str, b: int | str) -> ModelComparison:
         """Two ready versions: errors with intervals and paired gains, curves, differences in how they were made."""
-        return await self._client.send(calls.versions_compare(name, a, b))
+        asked = {"a": str(a), "b": str(b)}
+        return await self._client.send(
+            Call("GET", route("models", name, "compare"), ModelComparison, query=asked)
+        )
 
     async def signing_keys(self) -> tuple[SigningKey, ...]:
         """Every public key that signs, or once signed, this service's models."""
-        page = await self._client.send(calls.signing_keys())
-        return tuple(page.data)
+        call = Call("GET", route("signing-keys"), page_of(SigningKey), query={"limit": 200})
+        return tuple((await self._client.send(call)).data)
 
     async def trust(self, key: str | Path) -> str:
         """Trusts a key to sign this service's models, beside those that are; its fingerprint.
@@ -363,11 +386,13 @@ class AsyncPipelines(AsyncResource):
 
     async def create(self, body: PipelineCreate | None = None, *, scene_id: str | None = None) -> Job:
         """Starts fit, dataset and training; from a full body, or with the defaults for a scene."""
-        asked = calls.pipeline_body(body, scene_id)
+        if (body is None) == (scene_id is None):
+            raise TypeError("pipelines.create takes either a PipelineCreate or scene_id")
+        asked = PipelineCreate(scene_id=str(scene_id)) if body is None else body
         scene = await self._client.scenes.id_of(asked.scene_id)
         further = [await self._client.scenes.id_of(one) for one in asked.scene_ids]
         named = asked.model_copy(update={"scene_id": scene, "scene_ids": further})
-        return await self._client.send(calls.pipeline_create(named))
+        return await self._send("POST", Job, "pipelines", body=named)
 
 
 class AsyncJobs(AsyncListed):
@@ -377,7 +402,10 @@ class AsyncJobs(AsyncListed):
 
     async def get(self, job_id: str, *, wait_s: float | None = None) -> Job:
         """One job; with ``wait_s`` the answer comes at the job's end or after that many seconds."""
-        return await self._client.send(calls.job_get(await self.id_of(job_id), wait_s=wait_s))
+        path = route("jobs", await self.id_of(job_id))
+        return await self._client.send(
+            Call("GET", path, Job, query=given(wait=wait_s), read_timeout_s=wait_s or 0.0)
+        )
 
     async def list(
         self,
@@ -395,17 +423,15 @@ class AsyncJobs(AsyncListed):
             state: only those in this state.
             kind: only those of this kind.
         """
-        return await self._page(
-            lambda at: calls.job_list(limit=limit, cursor=at, state=state, kind=kind), cursor
-        )
+        return await self._page(Job, "jobs", cursor=cursor, limit=limit, state=state, kind=kind)
 
     async def retry(self, job_id: str) -> Job:
         """Takes a failed job up again, with its pipeline: stored episodes, journals and checkpoints are kept."""
-        return await self._client.send(calls.job_retry(await self.id_of(job_id)))
+        return await self._send("POST", Job, "jobs", await self.id_of(job_id), "retry")
 
     async def cancel(self, job_id: str) -> Job:
         """Asks for the job's end; it is ``cancelling`` until its workers have let go."""
-        return await self._client.send(calls.job_cancel(await self.id_of(job_id)))
+        return await self._send("POST", Job, "jobs", await self.id_of(job_id), "cancel")
 
     async def events(self, job_id: str, *, after: int | None = None) -> AsyncIterator[Event]:
         """The job's events, past and coming, until the one that ends the job.
@@ -486,9 +512,8 @@ class AsyncJobs(AsyncListed):
     async def _lines(self, job_id: str, decoder: EventDecoder) -> AsyncIterator[str]:
         http = self._client.http
         timeout = httpx.Timeout(self._client.timeout, read=IDLE_LIMIT_S)
-        async with http.stream(
-            "GET", calls.events_path(job_id), headers=decoder.headers(), timeout=timeout
-        ) as response:
+        path = route("jobs", job_id, "events")
+        async with http.stream("GET", path, headers=decoder.headers(), timeout=timeout) as response:
             if response.status_code >= 400:
                 await response.aread()
                 transport.raise_for_problem(response)

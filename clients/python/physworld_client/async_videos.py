@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from physworld_client import films
 from physworld_client.async_base import AsyncListed
+from physworld_client.bundle import picture_at
+from physworld_client.calls import Call, route
 from physworld_client.pages import AsyncListPage
 from physworld_client.types import Job, Scene, Video
-from physworld_schemas.video import FILM, FilmName, VideoConfig, VideoOf
+from physworld_schemas.video import FILM, FilmName, VideoConfig, VideoCreate, VideoOf
 
 
 class AsyncVideos(AsyncListed):
@@ -24,11 +25,12 @@ class AsyncVideos(AsyncListed):
             id: of that; of a model "name", "name:3" or "name:alias".
             config: camera, size and what is drawn; by default the scene's own camera and splat, where it has them.
         """
-        return await self._client.send(films.create(of, await self._source(of, id), config))
+        body = VideoCreate(of=of, id=await self._source(of, id), config=config or VideoConfig())
+        return await self._send("POST", Job, "videos", body=body)
 
     async def get(self, video_id: str) -> Video:
         """One film: what was drawn, and its scores against the scene's pictures."""
-        return await self._client.send(films.get(await self.id_of(video_id)))
+        return await self._send("GET", Video, "videos", await self.id_of(video_id))
 
     async def list(
         self,
@@ -51,7 +53,7 @@ class AsyncVideos(AsyncListed):
         scene = None if scene_id is None else await self._client.scenes.id_of(scene_id)
         source = source_id if source_id is None or of is None else await self._source(of, source_id)
         return await self._page(
-            lambda at: films.listed(limit=limit, cursor=at, scene_id=scene, of=of, source_id=source), cursor
+            Video, "videos", cursor=cursor, limit=limit, scene_id=scene, of=of, source_id=source
         )
 
     async def download(self, video_id: str, path: str | Path, name: FilmName = FILM) -> Path:
@@ -87,9 +89,10 @@ class AsyncVideos(AsyncListed):
             BundleUnreadable: nothing is there, or a file of another kind.
         """
         scene = await self._client.scenes.id_of(scene_id)
-        name, upload = films.picture_at(path)
+        name, upload = picture_at(path)
         with upload, self._client.bars.sending(upload) as sent:
-            return await self._client.send(films.put_picture(scene, name, sent))
+            call = Call("POST", route("scenes", scene, "pictures", name), Scene, upload=sent)
+            return await self._client.send(call)
 
     async def _source(self, of: VideoOf, given: str) -> str:
         """The id of what a film is of; a model's name, with or without a version, is taken as it is."""

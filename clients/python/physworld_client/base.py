@@ -1,5 +1,5 @@
 # Made of async_base.py by `make sdk`: change that file.
-"""What the resources share: the client they send through, pages, and names in the place of ids."""
+"""What the resources share: the requests they send, pages, and names in the place of ids."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from pydantic import BaseModel
 
-from physworld_client import calls, names
+from physworld_client import names
+from physworld_client.calls import Call, given, page_of, route
 from physworld_client.pages import ListPage
 
 if TYPE_CHECKING:
     from physworld_client.client import Client
 
+Answer = TypeVar("Answer")
 Item = TypeVar("Item", bound=BaseModel)
 
 
@@ -25,9 +27,24 @@ class Resource:
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self._client.base_url}>"
 
-    def _page(self, call_at: calls.ListCall[Item], cursor: str | None) -> ListPage[Item]:
-        page = self._client.send(call_at(cursor))
-        return ListPage(page.data, page.has_more, page.next_cursor, lambda at: self._page(call_at, at))
+    def _send(
+        self, method: str, answer: type[Answer], *places: str | int, body: BaseModel | None = None
+    ) -> Answer:
+        """The answer of ``/v1/`` and the places of the path."""
+        return self._client.send(Call(method, route(*places), answer, body=body))
+
+    def _page(
+        self, item: type[Item], *places: str | int, cursor: str | None, **query: str | int | None
+    ) -> ListPage[Item]:
+        """A page of a list from a cursor on; what of the query is None is not asked."""
+        asked = given(cursor=cursor, **query)
+        page = self._client.send(Call("GET", route(*places), page_of(item), query=asked))
+        return ListPage(
+            page.data,
+            page.has_more,
+            page.next_cursor,
+            lambda at: self._page(item, *places, cursor=at, **query),
+        )
 
 
 class Listed(Resource):

@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import IO
 
 from physworld_client.errors import BundleUnreadable
+from physworld_schemas.video import PictureName
 from physworld_schemas.wording import pictures_among
 
 BUNDLE_FILES = ("scene.json", "scene.npz")
@@ -27,6 +28,8 @@ PICTURED = (*COMPRESSED, ".npy", ".json", ".pkl", ".csv")
 """What belongs to a folder of pictures: those, their depth, tracks, cameras and logs."""
 SPOOL_LIMIT_BYTES = 64 * 2**20
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+PICTURES: dict[str, PictureName] = {".ply": "splat.ply", ".json": "camera.json", ".npz": "frames.npz"}
+"""What a file beside a scene is, by its ending."""
 MEDIA_TYPES = {".zip": "application/zip", ".gz": "application/gzip", ".tgz": "application/gzip"}
 
 
@@ -118,6 +121,15 @@ def open_file(path: str | Path) -> Upload:
     except OSError as error:
         raise BundleUnreadable(f"{source} cannot be read: {error.strerror}") from error
     return Upload(stream, source.name, MEDIA_TYPES.get(source.suffix.lower(), "application/octet-stream"))
+
+
+def picture_at(path: str | Path) -> tuple[PictureName, Upload]:
+    """What the file beside a scene is, by its ending, and the open file. Raises BundleUnreadable."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in PICTURES:
+        known = ", ".join(f"{ending} ({name})" for ending, name in PICTURES.items())
+        raise BundleUnreadable(f"{path} ends in {suffix!r}; the pictures of a scene are {known}")
+    return PICTURES[suffix], open_file(path)
 
 
 def _pack_folder(folder: Path) -> Upload:

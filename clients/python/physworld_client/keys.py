@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-from physworld_client import calls
 from physworld_client.base import Listed
 from physworld_client.pages import ListPage
 from physworld_client.types import ApiKey
-from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, Role
+from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, KeyCreate, KeyRotate, Role
 
 
 class Keys(Listed):
@@ -25,16 +24,18 @@ class Keys(Listed):
             role: "read", "write", or "admin", which may manage keys too.
             expires_in_days: its term; None: it never ends.
         """
-        return self._client.send(calls.key_create(name, role, expires_in_days))
+        body = KeyCreate(name=name, role=role, expires_in_days=expires_in_days)
+        return self._send("POST", ApiKey, "keys", body=body)
 
     def list(self, *, limit: int | None = None, cursor: str | None = None) -> ListPage[ApiKey]:
         """Keys, newest first, the revoked and expired ones too."""
-        return self._page(lambda at: calls.key_list(limit=limit, cursor=at), cursor)
+        return self._page(ApiKey, "keys", cursor=cursor, limit=limit)
 
     def rotate(self, key_id: str, *, grace_minutes: int | None = None) -> ApiKey:
         """Gives a key another token and its whole term again; the old token stays good for the grace."""
-        return self._client.send(calls.key_rotate(self.id_of(key_id), grace_minutes))
+        body = KeyRotate() if grace_minutes is None else KeyRotate(grace_minutes=grace_minutes)
+        return self._send("POST", ApiKey, "keys", self.id_of(key_id), "rotate", body=body)
 
     def revoke(self, key_id: str) -> ApiKey:
         """Ends a key, and what it opened, at once."""
-        return self._client.send(calls.key_revoke(self.id_of(key_id)))
+        return self._send("DELETE", ApiKey, "keys", self.id_of(key_id))

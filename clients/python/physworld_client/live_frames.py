@@ -11,7 +11,6 @@ from urllib.parse import urlencode
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import TypeAdapter
 from websockets.asyncio.client import ClientConnection as AsyncClientConnection
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
@@ -28,7 +27,6 @@ MOST_BYTES = 64 * 2**20
 RESET = json.dumps({"type": "reset"})
 _HEAD = struct.Struct("<IIfI")
 _SET_BACK = 1
-_TICKET = TypeAdapter(LiveTicket)
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ class LiveFrame:
 def ticket_create(model: str, version: int | str) -> Call[LiveTicket]:
     """The ticket of one connection."""
     body = LiveTicketCreate.model_validate({"model": model, "version": version})
-    return Call("POST", "/v1/live/tickets", _TICKET, body=body)
+    return Call("POST", "/v1/live/tickets", LiveTicket, body=body)
 
 
 def address(base_url: str, ticket: LiveTicket, frames: int, part: Part) -> str:

@@ -5,19 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from physworld_client import calls
 from physworld_client.arrays import arrays_of
 from physworld_client.base import Listed
 from physworld_client.pages import ListPage
 from physworld_client.resources import LATEST
 from physworld_client.types import Array, Assessment, Check, Job, Loop, Trace
 from physworld_schemas.assessment import AssessmentCreate, Frames
-from physworld_schemas.check import CheckConfig
+from physworld_schemas.check import CheckConfig, CheckCreate
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import TrainingConfig
-from physworld_schemas.trace import TraceConfig
+from physworld_schemas.trace import TraceConfig, TraceCreate
 
 
 class Checks(Listed):
@@ -28,18 +27,19 @@ class Checks(Listed):
     def create(self, scene_id: str, config: CheckConfig | None = None) -> Job:
         """Starts a check; its job's output is the check."""
         scene = self._client.scenes.id_of(scene_id)
-        return self._client.send(calls.check_create(scene, config))
+        body = CheckCreate(scene_id=scene, config=config or CheckConfig())
+        return self._send("POST", Job, "checks", body=body)
 
     def get(self, check_id: str) -> Check:
         """One check: once it is ready, its report."""
-        return self._client.send(calls.check_get(self.id_of(check_id)))
+        return self._send("GET", Check, "checks", self.id_of(check_id))
 
     def list(
         self, *, limit: int | None = None, cursor: str | None = None, scene_id: str | None = None
     ) -> ListPage[Check]:
         """Checks, newest first."""
         scene = None if scene_id is None else self._client.scenes.id_of(scene_id)
-        return self._page(lambda at: calls.check_list(limit=limit, cursor=at, scene_id=scene), cursor)
+        return self._page(Check, "checks", cursor=cursor, limit=limit, scene_id=scene)
 
 
 class Traces(Listed):
@@ -68,15 +68,20 @@ class Traces(Listed):
             held_out_scene_ids: recordings that only the report sees.
         """
         scenes = self._client.scenes
-        first = scenes.id_of(scene_id)
-        further = [scenes.id_of(one) for one in scene_ids]
-        held_out = [scenes.id_of(one) for one in held_out_scene_ids]
-        twin = None if fit_id is None else self._client.fits.id_of(fit_id)
-        return self._client.send(calls.trace_create(first, config, fit, twin, further, held_out))
+        body = TraceCreate(
+            scene_id=scenes.id_of(scene_id),
+            scene_ids=[scenes.id_of(one) for one in scene_ids],
+            held_out_scene_ids=[scenes.id_of(one) for one in held_out_scene_ids],
+            fit_id=None if fit_id is None else self._client.fits.id_of(fit_id),
+            config=config or TraceConfig(),
+        )
+        if fit is not None:
+            body = body.model_copy(update={"fit": fit})
+        return self._send("POST", Job, "traces", body=body)
 
     def get(self, trace_id: str) -> Trace:
         """One trace: the verdict and every figure of its report."""
-        return self._client.send(calls.trace_get(self.id_of(trace_id)))
+        return self._send("GET", Trace, "traces", self.id_of(trace_id))
 
     def list(
         self,
@@ -95,18 +100,16 @@ class Traces(Listed):
             verdict: only those with this verdict.
         """
         scene = None if scene_id is None else self._client.scenes.id_of(scene_id)
-        return self._page(
-            lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene, verdict=verdict), cursor
-        )
+        return self._page(Trace, "traces", cursor=cursor, limit=limit, scene_id=scene, verdict=verdict)
 
     def tracks(self, trace_id: str) -> dict[str, Array]:
         """``times`` (T,) [s], ``before`` and ``after`` (T, N, 3) [m]: open-loop tracks without and with the effects."""
-        return arrays_of(self._client.send(calls.trace_tracks(self.id_of(trace_id))))
+        return arrays_of(self._send("GET", bytes, "traces", self.id_of(trace_id), "tracks"))
 
     def cancel(self, trace_id: str) -> Job:
         """Asks for the end of the trace's job."""
         trace = self.get(trace_id)
-        return self._client.send(calls.job_cancel(trace.job_id))
+        return self._send("POST", Job, "jobs", trace.job_id, "cancel")
 
 
 class Assessments(Listed):
@@ -143,11 +146,11 @@ class Assessments(Listed):
             frames=frames,
             compared_with=compared_with,
         )
-        return self._client.send(calls.assessment_create(name, version, body))
+        return self._send("POST", Job, "models", name, "versions", version, "assessments", body=body)
 
     def get(self, assessment_id: str) -> Assessment:
         """One assessment."""
-        return self._client.send(calls.assessment_get(self.id_of(assessment_id)))
+        return self._send("GET", Assessment, "assessments", self.id_of(assessment_id))
 
     def list(
         self,
@@ -168,7 +171,10 @@ class Assessments(Listed):
         """
         if version is not None and name is None:
             raise ValueError(f"version {version} of which model? Give its name too")
-        return self._page(lambda at: calls.assessment_list(name, version, limit=limit, cursor=at), cursor)
+        if name is None or version is None:
+            return self._page(Assessment, "assessments", cursor=cursor, limit=limit, model=name)
+        places = ("models", name, "versions", version, "assessments")
+        return self._page(Assessment, *places, cursor=cursor, limit=limit)
 
 
 class Loops(Listed):
@@ -209,11 +215,11 @@ class Loops(Listed):
             dataset=dataset,
             training=training,
         )
-        return self._client.send(calls.loop_create(body))
+        return self._send("POST", Job, "loops", body=body)
 
     def get(self, loop_id: str) -> Loop:
         """One loop: how it ended, what it made, and the errors of both versions."""
-        return self._client.send(calls.loop_get(self.id_of(loop_id)))
+        return self._send("GET", Loop, "loops", self.id_of(loop_id))
 
     def list(
         self,
@@ -231,6 +237,4 @@ class Loops(Listed):
             model: only those of the model with this name.
             state: only those whose job is in this state.
         """
-        return self._page(
-            lambda at: calls.loop_list(limit=limit, cursor=at, model=model, state=state), cursor
-        )
+        return self._page(Loop, "loops", cursor=cursor, limit=limit, model=model, state=state)

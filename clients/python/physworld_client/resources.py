@@ -10,10 +10,11 @@ from pathlib import Path
 
 import httpx
 
-from physworld_client import calls, transport
+from physworld_client import transport
 from physworld_client.arrays import arrays_of
 from physworld_client.base import Listed, Resource
 from physworld_client.bundle import open_bundle, open_pictures
+from physworld_client.calls import Call, given, page_of, route
 from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.export import open_export
 from physworld_client.known_keys import is_fingerprint, trusted_keys
@@ -36,12 +37,12 @@ from physworld_client.types import (
     SigningKey,
 )
 from physworld_client.waiting import Patience, job_id_of, require_success
-from physworld_schemas.dataset import DatasetConfig
-from physworld_schemas.fit import FitConfig
+from physworld_schemas.dataset import DatasetConfig, DatasetCreate
+from physworld_schemas.fit import FitConfig, FitCreate
 from physworld_schemas.job import TERMINAL_STATES
-from physworld_schemas.model import TrainingConfig
+from physworld_schemas.model import AliasSet, TrainingConfig, TrainingCreate, VersionPatch
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_schemas.scene import SceneImport
+from physworld_schemas.scene import SceneImport, ScenePatch
 from physworld_schemas.tracking import TrackingOptions, TrackingPreview
 
 LATEST = "latest"
@@ -60,20 +61,23 @@ class Scenes(Listed):
             options: what a foreign recording does not say of itself.
         """
         with open_bundle(path) as upload, self._client.bars.sending(upload) as sent:
-            return self._client.send(calls.scene_create(sent, options))
+            call = Call("POST", route("scenes"), Scene, upload=sent, form=_form(options))
+            return self._client.send(call)
 
     def preview(self, path: str | Path, options: SceneImport | None = None) -> ScenePreview:
         """What an import of a recording would guess: axes, unit, rate, gripper, noise. Nothing is stored."""
         with open_bundle(path) as upload, self._client.bars.sending(upload) as sent:
-            return self._client.send(calls.scene_preview(sent, options))
+            call = Call("POST", route("scenes", "preview"), ScenePreview, upload=sent, form=_form(options))
+            return self._client.send(call)
 
     def get(self, scene_id: str) -> Scene:
         """One scene."""
-        return self._client.send(calls.scene_get(self.id_of(scene_id)))
+        return self._send("GET", Scene, "scenes", self.id_of(scene_id))
 
     def update(self, scene_id: str, *, tags: tuple[str, ...]) -> Scene:
         """Gives a scene these tags, in the place of those before. The recording itself never changes."""
-        return self._client.send(calls.scene_patch(self.id_of(scene_id), tags))
+        body = ScenePatch(tags=[*tags])
+        return self._send("PATCH", Scene, "scenes", self.id_of(scene_id), body=body)
 
     def list(
         self,
@@ -91,7 +95,12 @@ class Scenes(Listed):
             kind: only those of this kind.
             tag: only those with this tag.
         """
-        return self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind, tag=tag), cursor)
+        return self._page(Scene, "scenes", cursor=cursor, limit=limit, kind=kind, tag=tag)
+
+
+def _form(options: SceneImport | TrackingOptions | None) -> dict[str, str]:
+    """What stands beside an upload."""
+    return {} if options is None else {"options": options.model_dump_json(exclude_unset=True)}
 
 
 class Trackings(Resource):
@@ -111,12 +120,14 @@ class Trackings(Resource):
             files: further files by the names that the options give them: masks, tracks, a robot's log, a camera.
         """
         with open_pictures(path, files) as upload, self._client.bars.sending(upload) as sent:
-            return self._client.send(calls.tracking_create(sent, options))
+            call = Call("POST", route("trackings"), Job, upload=sent, form=_form(options))
+            return self._client.send(call)
 
     def preview(self, path: str | Path) -> TrackingPreview:
         """The first picture of each camera, in whose pixels the options speak. Nothing is stored."""
         with open_pictures(path) as upload, self._client.bars.sending(upload) as sent:
-            return self._client.send(calls.tracking_preview(sent))
+            call = Call("POST", route("trackings", "preview"), TrackingPreview, upload=sent)
+            return self._client.send(call)
 
 
 class Fits(Listed):
@@ -128,17 +139,18 @@ class Fits(Listed):
         """Starts a fit; its job's output is the fit. ``scene_ids``: further recordings of the object, fitted too."""
         scene = self._client.scenes.id_of(scene_id)
         further = [self._client.scenes.id_of(one) for one in scene_ids]
-        return self._client.send(calls.fit_create(scene, config, further))
+        body = FitCreate(scene_id=scene, scene_ids=further, config=config or FitConfig())
+        return self._send("POST", Job, "fits", body=body)
 
     def get(self, fit_id: str) -> Fit:
         """One fit."""
-        return self._client.send(calls.fit_get(self.id_of(fit_id)))
+        return self._send("GET", Fit, "fits", self.id_of(fit_id))
 
     def list(
         self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
     ) -> ListPage[Fit]:
         """Fits, newest first."""
-        return self._page(lambda at: calls.fit_list(limit=limit, cursor=at, state=state), cursor)
+        return self._page(Fit, "fits", cursor=cursor, limit=limit, state=state)
 
 
 class Datasets(Listed):
@@ -150,24 +162,25 @@ class Datasets(Listed):
         """Starts writing a dataset, in the twin that the trace made where it added an effect."""
         fit = self._client.fits.id_of(fit_id)
         trace = None if trace_id is None else self._client.traces.id_of(trace_id)
-        return self._client.send(calls.dataset_create(fit, config, trace))
+        body = DatasetCreate(fit_id=fit, trace_id=trace, config=config or DatasetConfig())
+        return self._send("POST", Job, "datasets", body=body)
 
     def get(self, dataset_id: str) -> Dataset:
         """One dataset."""
-        return self._client.send(calls.dataset_get(self.id_of(dataset_id)))
+        return self._send("GET", Dataset, "datasets", self.id_of(dataset_id))
 
     def list(
         self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
     ) -> ListPage[Dataset]:
         """Datasets, newest first."""
-        return self._page(lambda at: calls.dataset_list(limit=limit, cursor=at, state=state), cursor)
+        return self._page(Dataset, "datasets", cursor=cursor, limit=limit, state=state)
 
     def episodes(
         self, dataset_id: str, *, limit: int | None = None, cursor: str | None = None
     ) -> ListPage[Episode]:
         """The committed episodes of a dataset."""
         dataset = self.id_of(dataset_id)
-        return self._page(lambda at: calls.dataset_episodes(dataset, limit=limit, cursor=at), cursor)
+        return self._page(Episode, "datasets", dataset, "episodes", cursor=cursor, limit=limit)
 
     def episode(self, dataset_id: str, index: int) -> dict[str, Array]:
         """The arrays of one committed episode.
@@ -180,7 +193,7 @@ class Datasets(Listed):
             NotFound: no such episode is committed.
         """
         dataset = self.id_of(dataset_id)
-        return arrays_of(self._client.send(calls.dataset_episode(dataset, index)))
+        return arrays_of(self._send("GET", bytes, "datasets", dataset, "episodes", index))
 
     def export(
         self,
@@ -239,33 +252,41 @@ class Models(Listed):
             tags: of the version.
         """
         dataset = self._client.datasets.id_of(dataset_id)
-        return self._client.send(calls.training_create(name, dataset, config, description, [*tags]))
+        body = TrainingCreate(
+            name=name,
+            dataset_id=dataset,
+            config=config or TrainingConfig(),
+            description=description,
+            tags=[*tags],
+        )
+        return self._send("POST", Job, "models", body=body)
 
     def get(self, name: str) -> Model:
         """One registered name with its newest version and aliases."""
-        return self._client.send(calls.model_get(name))
+        return self._send("GET", Model, "models", name)
 
     def list(self, *, limit: int | None = None, cursor: str | None = None) -> ListPage[Model]:
         """Registered names."""
-        return self._page(lambda at: calls.model_list(limit=limit, cursor=at), cursor)
+        return self._page(Model, "models", cursor=cursor, limit=limit)
 
     def versions(
         self, name: str, *, limit: int | None = None, cursor: str | None = None
     ) -> ListPage[ModelVersion]:
         """Versions of a name, newest first."""
-        return self._page(lambda at: calls.version_list(name, limit=limit, cursor=at), cursor)
+        return self._page(ModelVersion, "models", name, "versions", cursor=cursor, limit=limit)
 
     def version(self, name: str, version: int | str = LATEST) -> ModelVersion:
         """One version: by its number, by an alias, or the newest that is ready."""
-        return self._client.send(calls.version_get(name, version))
+        return self._send("GET", ModelVersion, "models", name, "versions", version)
 
     def set_alias(self, name: str, alias: str, version: int) -> Model:
         """Moves an alias to a version."""
-        return self._client.send(calls.alias_set(name, alias, version))
+        body = AliasSet(version=version)
+        return self._send("PUT", Model, "models", name, "aliases", alias, body=body)
 
     def delete_alias(self, name: str, alias: str) -> Model:
         """Removes an alias; the version stays."""
-        return self._client.send(calls.alias_delete(name, alias))
+        return self._send("DELETE", Model, "models", name, "aliases", alias)
 
     def update(
         self,
@@ -283,16 +304,18 @@ class Models(Listed):
             description: the new one; None: as it is.
             tags: the new ones; None: as they are.
         """
-        return self._client.send(calls.version_patch(name, version, description, tags))
+        body = VersionPatch(description=description, tags=None if tags is None else [*tags])
+        return self._send("PATCH", ModelVersion, "models", name, "versions", version, body=body)
 
     def compare(self, name: str, a: int | str, b: int | str) -> ModelComparison:
         """Two ready versions: errors with intervals and paired gains, curves, differences in how they were made."""
-        return self._client.send(calls.versions_compare(name, a, b))
+        asked = {"a": str(a), "b": str(b)}
+        return self._client.send(Call("GET", route("models", name, "compare"), ModelComparison, query=asked))
 
     def signing_keys(self) -> tuple[SigningKey, ...]:
         """Every public key that signs, or once signed, this service's models."""
-        page = self._client.send(calls.signing_keys())
-        return tuple(page.data)
+        call = Call("GET", route("signing-keys"), page_of(SigningKey), query={"limit": 200})
+        return tuple((self._client.send(call)).data)
 
     def trust(self, key: str | Path) -> str:
         """Trusts a key to sign this service's models, beside those that are; its fingerprint.
@@ -358,11 +381,13 @@ class Pipelines(Resource):
 
     def create(self, body: PipelineCreate | None = None, *, scene_id: str | None = None) -> Job:
         """Starts fit, dataset and training; from a full body, or with the defaults for a scene."""
-        asked = calls.pipeline_body(body, scene_id)
+        if (body is None) == (scene_id is None):
+            raise TypeError("pipelines.create takes either a PipelineCreate or scene_id")
+        asked = PipelineCreate(scene_id=str(scene_id)) if body is None else body
         scene = self._client.scenes.id_of(asked.scene_id)
         further = [self._client.scenes.id_of(one) for one in asked.scene_ids]
         named = asked.model_copy(update={"scene_id": scene, "scene_ids": further})
-        return self._client.send(calls.pipeline_create(named))
+        return self._send("POST", Job, "pipelines", body=named)
 
 
 class Jobs(Listed):
@@ -372,7 +397,10 @@ class Jobs(Listed):
 
     def get(self, job_id: str, *, wait_s: float | None = None) -> Job:
         """One job; with ``wait_s`` the answer comes at the job's end or after that many seconds."""
-        return self._client.send(calls.job_get(self.id_of(job_id), wait_s=wait_s))
+        path = route("jobs", self.id_of(job_id))
+        return self._client.send(
+            Call("GET", path, Job, query=given(wait=wait_s), read_timeout_s=wait_s or 0.0)
+        )
 
     def list(
         self,
@@ -390,15 +418,15 @@ class Jobs(Listed):
             state: only those in this state.
             kind: only those of this kind.
         """
-        return self._page(lambda at: calls.job_list(limit=limit, cursor=at, state=state, kind=kind), cursor)
+        return self._page(Job, "jobs", cursor=cursor, limit=limit, state=state, kind=kind)
 
     def retry(self, job_id: str) -> Job:
         """Takes a failed job up again, with its pipeline: stored episodes, journals and checkpoints are kept."""
-        return self._client.send(calls.job_retry(self.id_of(job_id)))
+        return self._send("POST", Job, "jobs", self.id_of(job_id), "retry")
 
     def cancel(self, job_id: str) -> Job:
         """Asks for the job's end; it is ``cancelling`` until its workers have let go."""
-        return self._client.send(calls.job_cancel(self.id_of(job_id)))
+        return self._send("POST", Job, "jobs", self.id_of(job_id), "cancel")
 
     def events(self, job_id: str, *, after: int | None = None) -> Iterator[Event]:
         """The job's events, past and coming, until the one that ends the job.
@@ -479,9 +507,8 @@ class Jobs(Listed):
     def _lines(self, job_id: str, decoder: EventDecoder) -> Iterator[str]:
         http = self._client.http
         timeout = httpx.Timeout(self._client.timeout, read=IDLE_LIMIT_S)
-        with http.stream(
-            "GET", calls.events_path(job_id), headers=decoder.headers(), timeout=timeout
-        ) as response:
+        path = route("jobs", job_id, "events")
+        with http.stream("GET", path, headers=decoder.headers(), timeout=timeout) as response:
             if response.status_code >= 400:
                 response.read()
                 transport.raise_for_problem(response)

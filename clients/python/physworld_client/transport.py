@@ -17,9 +17,9 @@ from email.utils import parsedate_to_datetime
 from typing import Any
 
 import httpx
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
-from physworld_client.calls import BYTES, Call
+from physworld_client.calls import Call
 from physworld_client.errors import (
     ConnectionFailed,
     PhysWorldError,
@@ -154,10 +154,10 @@ def new_key() -> str:
 def read_answer(call: Call[Any], response: httpx.Response) -> Any:
     """The typed answer of a call, or the typed error."""
     raise_for_problem(response)
-    if call.answer is BYTES:
+    if call.answer is bytes:
         return response.content
     try:
-        return call.answer.validate_json(response.content)
+        return TypeAdapter(call.answer).validate_json(response.content)
     except ValidationError as error:
         fault = error.errors()[0]
         place = ".".join(str(part) for part in fault["loc"])

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from physworld_client import films
 from physworld_client.base import Listed
+from physworld_client.bundle import picture_at
+from physworld_client.calls import Call, route
 from physworld_client.pages import ListPage
 from physworld_client.types import Job, Scene, Video
-from physworld_schemas.video import FILM, FilmName, VideoConfig, VideoOf
+from physworld_schemas.video import FILM, FilmName, VideoConfig, VideoCreate, VideoOf
 
 
 class Videos(Listed):
@@ -25,11 +26,12 @@ class Videos(Listed):
             id: of that; of a model "name", "name:3" or "name:alias".
             config: camera, size and what is drawn; by default the scene's own camera and splat, where it has them.
         """
-        return self._client.send(films.create(of, self._source(of, id), config))
+        body = VideoCreate(of=of, id=self._source(of, id), config=config or VideoConfig())
+        return self._send("POST", Job, "videos", body=body)
 
     def get(self, video_id: str) -> Video:
         """One film: what was drawn, and its scores against the scene's pictures."""
-        return self._client.send(films.get(self.id_of(video_id)))
+        return self._send("GET", Video, "videos", self.id_of(video_id))
 
     def list(
         self,
@@ -52,7 +54,7 @@ class Videos(Listed):
         scene = None if scene_id is None else self._client.scenes.id_of(scene_id)
         source = source_id if source_id is None or of is None else self._source(of, source_id)
         return self._page(
-            lambda at: films.listed(limit=limit, cursor=at, scene_id=scene, of=of, source_id=source), cursor
+            Video, "videos", cursor=cursor, limit=limit, scene_id=scene, of=of, source_id=source
         )
 
     def download(self, video_id: str, path: str | Path, name: FilmName = FILM) -> Path:
@@ -88,9 +90,10 @@ class Videos(Listed):
             BundleUnreadable: nothing is there, or a file of another kind.
         """
         scene = self._client.scenes.id_of(scene_id)
-        name, upload = films.picture_at(path)
+        name, upload = picture_at(path)
         with upload, self._client.bars.sending(upload) as sent:
-            return self._client.send(films.put_picture(scene, name, sent))
+            call = Call("POST", route("scenes", scene, "pictures", name), Scene, upload=sent)
+            return self._client.send(call)
 
     def _source(self, of: VideoOf, given: str) -> str:
         """The id of what a film is of; a model's name, with or without a version, is taken as it is."""

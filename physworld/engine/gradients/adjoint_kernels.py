@@ -256,3 +256,12 @@ def add_memory_work(
     """Add bar (high - low) of one number of a memory."""
     k = wp.tid()
     wp.atomic_add(total, 0, bar[k] * (wp.float64(high[k]) - wp.float64(low[k])))
+
+
+# All that a run can ask for is declared: whatever came later would compile the module anew.
+for _real in (wp.float32, wp.float64):
+    for _kernel in (keep_row, last_positions, take_nodes_back):
+        wp.overload(_kernel, {"history": wp.array2d(dtype=_real)})
+    for _kernel in (keep_rows, load_row):
+        wp.overload(_kernel, {"memory": wp.array(dtype=_real)})
+    wp.overload(add_memory_work, {"high": wp.array(dtype=_real), "low": wp.array(dtype=_real)})

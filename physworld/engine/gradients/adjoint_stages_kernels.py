@@ -236,3 +236,8 @@ def leave_stages_back(
             path_x_bar[frame + 1, p] += h01 * goal
             path_v_bar[frame, p] += clock[0] * h10 * goal
             path_v_bar[frame + 1, p] += clock[0] * h11 * goal
+
+
+# All that a run can ask for is declared: whatever came later would compile the module anew.
+for _real in (wp.float32, wp.float64):
+    wp.overload(enter_stages_back, {"history": wp.array2d(dtype=_real), "forces": wp.array2d(dtype=_real)})

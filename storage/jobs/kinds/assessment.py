@@ -9,17 +9,18 @@ from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
 from physworld_schemas.assessment import AssessmentCreate, ComparedVersion, ErrorFigure, Outcome
-from physworld_schemas.base import Reference, Unmade
+from physworld_schemas.base import Reference
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.ids import new_id
 from physworld_schemas.trace import TRACE_PARTICLES
 from physworld_storage import traces
 from physworld_storage.errors import Conflict
 from physworld_storage.jobs.events import append_event
-from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, scene_row
+from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of
 from physworld_storage.jobs.kinds import trace
 from physworld_storage.registry import reference_id, version_row
-from physworld_storage.tables import AssessmentRow, JobRow, ModelVersionRow, ShardRow
+from physworld_storage.rows import required
+from physworld_storage.tables import AssessmentRow, JobRow, ModelVersionRow, SceneRow, ShardRow
 
 
 class AssessmentResult(ShardResult):
@@ -56,6 +57,7 @@ class AssessmentJobs(JobKind):
 
     name = "assessment"
     unit = "rollouts"
+    table = AssessmentRow
     shards = (
         ShardKind(
             "assessment",
@@ -86,7 +88,7 @@ class AssessmentJobs(JobKind):
         model = assessable(session, name, version)
         other = request.compared_with
         compared = None if other is None else assessable(session, name, other)
-        scene = scene_row(session, request.scene_id)
+        scene = required(session, SceneRow, request.scene_id)
         assessment_id = new_id("assessment")
         job = self.queued(
             session,
@@ -115,14 +117,6 @@ class AssessmentJobs(JobKind):
     def seconds(self, config: dict[str, Any]) -> float:
         """Of one recording."""
         return 5.0
-
-    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
-        """The assessment has failed or was cancelled."""
-        traces.end_assessment(session, output_of(job), state)
-
-    def reopen(self, session: Session, job: JobRow) -> None:
-        """The assessment is pending again."""
-        traces.assessment_row(session, output_of(job)).state = "pending"
 
 
 KIND = AssessmentJobs()

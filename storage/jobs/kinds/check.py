@@ -5,13 +5,14 @@ from __future__ import annotations
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Reference, Unmade
+from physworld_schemas.base import Reference
 from physworld_schemas.check import CheckCreate, CheckReport
 from physworld_schemas.ids import new_id
 from physworld_storage import checks
 from physworld_storage.jobs import helpers
-from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, scene_row
-from physworld_storage.tables import CheckRow, JobRow, ShardRow
+from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult
+from physworld_storage.rows import required
+from physworld_storage.tables import CheckRow, JobRow, SceneRow, ShardRow
 
 
 class CheckResult(ShardResult):
@@ -30,6 +31,7 @@ class CheckJobs(JobKind):
 
     name = "check"
     unit = "simulations"
+    table = CheckRow
     shards = (
         ShardKind(
             "check",
@@ -44,21 +46,13 @@ class CheckJobs(JobKind):
 
     def open(self, session: Session, request: CheckCreate) -> JobRow:
         """A check of a scene. Raises NotFound."""
-        scene = scene_row(session, request.scene_id)
+        scene = required(session, SceneRow, request.scene_id)
         check_id = new_id("check")
         config = request.config.model_dump(mode="json")
         inputs = [Reference(kind="scene", id=scene.id, digest=scene.digest)]
         job = self.queued(session, total=0, inputs=inputs, output_id=check_id, config=config)
         row = CheckRow(id=check_id, scene_id=scene.id, config=config)
         return self.begin(session, job, row, {"check_id": check_id, "scene_id": scene.id, "config": config})
-
-    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
-        """The check has failed or was cancelled."""
-        checks.end_check(session, output_of(job), state)
-
-    def reopen(self, session: Session, job: JobRow) -> None:
-        """The check is pending again."""
-        checks.check_row(session, output_of(job)).state = "pending"
 
 
 KIND = CheckJobs()

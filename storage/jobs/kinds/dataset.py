@@ -16,8 +16,9 @@ from physworld_storage.errors import Conflict
 from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, Tells, output_of
 from physworld_storage.jobs.kinds.fit import ready_fit
 from physworld_storage.jobs.shards import Stage
-from physworld_storage.tables import DatasetRow, JobRow, ShardRow
-from physworld_storage.traces import fit_digest, trace_digest, trace_row
+from physworld_storage.rows import required
+from physworld_storage.tables import DatasetRow, JobRow, ShardRow, TraceRow
+from physworld_storage.traces import fit_digest, trace_digest
 
 MAX_EPISODES = 20_000
 WRITING = 1
@@ -96,6 +97,7 @@ class DatasetJobs(JobKind):
 
     name = "dataset"
     unit = "episodes"
+    table = DatasetRow
     shards = (
         ShardKind(
             "dataset_plan",
@@ -149,7 +151,7 @@ class DatasetJobs(JobKind):
         fit = ready_fit(session, fit_id, "a dataset")
         inputs = [Reference(kind="fit", id=fit_id, digest=fit_digest(fit))]
         if trace_id is not None:
-            trace = trace_row(session, trace_id)
+            trace = required(session, TraceRow, trace_id)
             if trace.state != "ready":
                 raise Conflict(f"trace {trace_id} is {trace.state}; a dataset needs a ready trace")
             if trace.scene_id != fit.scene_id:

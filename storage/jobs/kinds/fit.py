@@ -8,14 +8,15 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference, Unmade
+from physworld_schemas.base import Artifact, Reference
 from physworld_schemas.fit import FitConfig, Parameter
 from physworld_schemas.ids import new_id
 from physworld_storage import resources
-from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.errors import Conflict
 from physworld_storage.jobs import helpers
-from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, scene_row
-from physworld_storage.tables import FitRow, JobRow, ShardRow
+from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult
+from physworld_storage.rows import required
+from physworld_storage.tables import FitRow, JobRow, SceneRow, ShardRow
 from physworld_storage.traces import fit_digest
 
 
@@ -42,6 +43,7 @@ class FitJobs(JobKind):
 
     name = "fit"
     unit = "simulations"
+    table = FitRow
     shards = (
         ShardKind(
             "fit", queues.SIMULATION, "physworld_workers.tasks.fit:run", FitResult, _apply, keeps_scratch=True
@@ -66,7 +68,7 @@ class FitJobs(JobKind):
             parent: the pipeline that it belongs to.
             scene_ids: further recordings of the object, fitted together with the first.
         """
-        scenes = [scene_row(session, known) for known in (scene_id, *scene_ids)]
+        scenes = [required(session, SceneRow, known) for known in (scene_id, *scene_ids)]
         for scene in scenes[1:]:
             if scene.kind != scenes[0].kind:
                 raise Conflict(
@@ -93,23 +95,13 @@ class FitJobs(JobKind):
         """By its particles; most searches end before their budget is spent."""
         return 3.0 + 0.0125 * float(config["particle_budget"])
 
-    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
-        """The fit has failed or was cancelled."""
-        resources.end_fit(session, output_of(job), state)
-
-    def reopen(self, session: Session, job: JobRow) -> None:
-        """The fit is pending again."""
-        session.get_one(FitRow, output_of(job)).state = "pending"
-
 
 KIND = FitJobs()
 
 
 def ready_fit(session: Session, fit_id: str, for_what: str) -> FitRow:
     """The row of a ready fit. Raises NotFound, or Conflict when it is not ready."""
-    fit = session.get(FitRow, fit_id)
-    if fit is None:
-        raise NotFound("fit", fit_id)
+    fit = required(session, FitRow, fit_id)
     if fit.state != "ready":
         raise Conflict(f"fit {fit_id} is {fit.state}; {for_what} needs a ready fit")
     return fit

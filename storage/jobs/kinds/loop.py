@@ -27,11 +27,20 @@ from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import TrainingConfig, TrainingCreate
 from physworld_schemas.trace import NO_OTHER_PHYSICS, TRACE_PARTICLES
 from physworld_storage.errors import Conflict
-from physworld_storage.jobs.kind import JobKind, output_of, scene_row
+from physworld_storage.jobs.kind import JobKind, output_of
 from physworld_storage.jobs.kinds import assessment, dataset, trace, training
 from physworld_storage.registry import reference_id, resolve, trained_with
-from physworld_storage.tables import AssessmentRow, DatasetRow, FitRow, JobRow, ModelVersionRow, SceneRow
-from physworld_storage.traces import assessment_row, leaves_twin, trace_row
+from physworld_storage.rows import required
+from physworld_storage.tables import (
+    AssessmentRow,
+    DatasetRow,
+    FitRow,
+    JobRow,
+    ModelVersionRow,
+    SceneRow,
+    TraceRow,
+)
+from physworld_storage.traces import leaves_twin
 
 ASSESSMENT, TRACE, DATASET, TRAINING = (part.KIND.name for part in (assessment, trace, dataset, training))
 WORSE = "worse_than_expected"
@@ -56,7 +65,7 @@ class LoopJobs(JobKind):
         else:
             name, scene_id = str(request.model), str(request.scene_id)
             number = resolve(session, name, request.version)
-        model, scene = assessment.assessable(session, name, number), scene_row(session, scene_id)
+        model, scene = assessment.assessable(session, name, number), required(session, SceneRow, scene_id)
         _require_same_object(session, model, scene)
         _require_traceable(session, model, scene)
         asked = request.model_copy(update={"model": name, "version": number, "scene_id": scene_id})
@@ -86,12 +95,12 @@ class LoopJobs(JobKind):
         model = assessment.assessable(session, str(request.model), int(request.version))
         scene_id = str(request.scene_id)
         if ended.kind == ASSESSMENT:
-            worse = assessment_row(session, output_of(ended)).figures["outcome"] == WORSE
+            worse = required(session, AssessmentRow, output_of(ended)).figures["outcome"] == WORSE
             if is_comparison(ended) or not worse:
                 return False
             _open_trace(session, parent, model, scene_id, request)
         elif ended.kind == TRACE:
-            if not leaves_twin(trace_row(session, output_of(ended))):
+            if not leaves_twin(required(session, TraceRow, output_of(ended))):
                 return False
             own = None if model.dataset_id is None else session.get_one(DatasetRow, model.dataset_id)
             config = request.dataset or (
@@ -149,7 +158,7 @@ def request_of(job: JobRow) -> LoopCreate:
 
 def _worse(session: Session, assessment_id: str) -> AssessmentRow:
     """A ready assessment that found its model worse than expected. Raises NotFound, Conflict."""
-    row = assessment_row(session, assessment_id)
+    row = required(session, AssessmentRow, assessment_id)
     if row.state != "ready":
         raise Conflict(f"assessment {assessment_id} is {row.state}; a loop goes on from a ready one")
     if row.figures["outcome"] != WORSE:
@@ -161,7 +170,7 @@ def _worse(session: Session, assessment_id: str) -> AssessmentRow:
 
 def _require_same_object(session: Session, model: ModelVersionRow, scene: SceneRow) -> None:
     """Raises Conflict where the recording is the model's own, or shows another kind of object or other grips."""
-    home = scene_row(session, str(model.scene_id))
+    home = required(session, SceneRow, str(model.scene_id))
     called = f"version {model.version} of {model.name}"
     if scene.id == home.id:
         raise Conflict(
@@ -192,7 +201,7 @@ def _others(session: Session, model: ModelVersionRow, scene_id: str) -> list[str
     """What is traced with the fit's first recording: what the version's fit and trace had too, and the new one."""
     known = list(session.get_one(FitRow, model.fit_id).metrics.get("scene_ids", ()))
     if model.trace_id is not None:
-        known += trace_row(session, model.trace_id).report.get("scene_ids", ())
+        known += required(session, TraceRow, model.trace_id).report.get("scene_ids", ())
     return list(dict.fromkeys([*known, scene_id]))
 
 

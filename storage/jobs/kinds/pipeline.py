@@ -26,11 +26,12 @@ from physworld_schemas.job import TERMINAL_STATES
 from physworld_schemas.model import TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TRACE_PARTICLES
-from physworld_storage.jobs.kind import JobKind, output_of, scene_row
+from physworld_storage.jobs.kind import JobKind, output_of
 from physworld_storage.jobs.kinds import dataset, fit, trace, training
 from physworld_storage.registry import find_baseline
-from physworld_storage.tables import JobRow, TraceRow
-from physworld_storage.traces import leaves_twin, trace_row
+from physworld_storage.rows import required
+from physworld_storage.tables import JobRow, SceneRow, TraceRow
+from physworld_storage.traces import leaves_twin
 
 FIT, TRACE, DATASET, TRAINING = (part.KIND.name for part in (fit, trace, dataset, training))
 NAME_LENGTH = 64
@@ -46,13 +47,13 @@ class PipelineJobs(JobKind):
 
     def open(self, session: Session, request: PipelineCreate) -> JobRow:
         """The whole chain; its first child, the fit, is opened with it. Raises NotFound."""
-        scene = scene_row(session, request.scene_id)
+        scene = required(session, SceneRow, request.scene_id)
         name = request.model_name or model_name_of(scene.name)
         job = self.queued(
             session,
             total=100,
             inputs=[
-                Reference(kind="scene", id=known, digest=scene_row(session, known).digest)
+                Reference(kind="scene", id=known, digest=required(session, SceneRow, known).digest)
                 for known in (request.scene_id, *request.scene_ids)
             ],
             output_id=None,
@@ -93,7 +94,7 @@ class PipelineJobs(JobKind):
         elif last == TRAINING and not _is_comparison(session, children):
             return False
         else:
-            traced = trace_row(session, outputs[TRACE]) if TRACE in outputs else None
+            traced = required(session, TraceRow, outputs[TRACE]) if TRACE in outputs else None
             own = (
                 last == TRACE and traced is not None and _wants_comparison(session, request, traced, outputs)
             )
@@ -157,7 +158,7 @@ def _is_comparison(session: Session, children: Sequence[JobRow]) -> bool:
     kinds = [job.kind for job in children]
     if TRACE not in kinds or kinds.count(TRAINING) > 1:
         return False
-    traced = trace_row(session, output_of(children[kinds.index(TRACE)]))
+    traced = required(session, TraceRow, output_of(children[kinds.index(TRACE)]))
     last_dataset = next(job for job in reversed(children) if job.kind == DATASET)
     return leaves_twin(traced) and not _is_traced(last_dataset)
 

@@ -8,11 +8,11 @@ from pydantic import Field
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference, Unmade
+from physworld_schemas.base import Artifact, Reference
 from physworld_schemas.ids import new_id
 from physworld_storage import runs
 from physworld_storage.errors import Conflict
-from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of
+from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult
 from physworld_storage.registry import reference_id, version_row
 from physworld_storage.tables import JobRow, ModelVersionRow, RunRow, ShardRow
 
@@ -26,6 +26,8 @@ class RunResult(ShardResult):
 
 class RunJobs(JobKind):
     """Jobs that ask a model version something; ``unit`` is what their progress counts."""
+
+    table = RunRow
 
     def __init__(self, name: runs.RunKind, unit: str) -> None:
         self.name, self.unit = name, unit
@@ -80,14 +82,6 @@ class RunJobs(JobKind):
             "trace_id": model.trace_id,
         }
         return self.begin(session, job, row, payload)
-
-    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
-        """The run has failed or was cancelled."""
-        runs.end_run(session, self._run, output_of(job), state)
-
-    def reopen(self, session: Session, job: JobRow) -> None:
-        """The run is pending again."""
-        runs.run_row(session, self._run, output_of(job)).state = "pending"
 
     def _apply(self, session: Session, job: JobRow, shard: ShardRow, result: RunResult) -> None:
         run_id = shard.payload["run_id"]

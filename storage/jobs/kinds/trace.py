@@ -8,16 +8,17 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference, Unmade
+from physworld_schemas.base import Artifact, Reference
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.ids import new_id
 from physworld_schemas.trace import TraceConfig, Verdict
 from physworld_storage import traces
 from physworld_storage.errors import Conflict
 from physworld_storage.jobs import helpers
-from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, scene_row
+from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult
 from physworld_storage.jobs.kinds.fit import ready_fit
-from physworld_storage.tables import JobRow, ShardRow, TraceRow
+from physworld_storage.rows import required
+from physworld_storage.tables import JobRow, SceneRow, ShardRow, TraceRow
 
 
 class TraceResult(ShardResult):
@@ -34,7 +35,7 @@ def _apply(session: Session, job: JobRow, shard: ShardRow, result: TraceResult) 
     traces.mark_trace_ready(
         session, trace_id, result.verdict, result.report, result.artifacts, result.lineage
     )
-    KIND.fulfil(job, trace_id, traces.trace_digest(traces.trace_row(session, trace_id)))
+    KIND.fulfil(job, trace_id, traces.trace_digest(required(session, TraceRow, trace_id)))
 
 
 class TraceJobs(JobKind):
@@ -42,6 +43,7 @@ class TraceJobs(JobKind):
 
     name = "trace"
     unit = "percent"
+    table = TraceRow
     shards = (
         ShardKind(
             "trace",
@@ -78,7 +80,7 @@ class TraceJobs(JobKind):
             held_out_scene_ids: scenes that are only reported on.
         """
         inputs = [
-            Reference(kind="scene", id=known, digest=scene_row(session, known).digest)
+            Reference(kind="scene", id=known, digest=required(session, SceneRow, known).digest)
             for known in (scene_id, *scene_ids, *held_out_scene_ids)
         ]
         if fit_id is not None:
@@ -106,21 +108,13 @@ class TraceJobs(JobKind):
         asked = config["trace"]
         return 0.005 * float(config["fit"]["particle_budget"] * asked["confirmed"] * asked["iterations"])
 
-    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
-        """The trace has failed or was cancelled."""
-        traces.end_trace(session, output_of(job), state)
-
-    def reopen(self, session: Session, job: JobRow) -> None:
-        """The trace is pending again."""
-        traces.trace_row(session, output_of(job)).state = "pending"
-
 
 KIND = TraceJobs()
 
 
 def _fit_of(session: Session, fit_id: str, scene_id: str) -> Reference:
     fit = ready_fit(session, fit_id, "a trace")
-    home, scene = scene_row(session, fit.scene_id), scene_row(session, scene_id)
+    home, scene = required(session, SceneRow, fit.scene_id), required(session, SceneRow, scene_id)
     if home.kind != scene.kind:
         raise Conflict(f"fit {fit_id} is of a {home.kind}, scene {scene_id} shows a {scene.kind}")
     if (fit.metrics.get("local") or {}).get("kept"):

@@ -12,8 +12,9 @@ from physworld_schemas.base import Artifact, Reference, Unmade
 from physworld_schemas.job import Job
 from physworld_schemas.model import TrainingCreate
 from physworld_storage import registry
-from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.errors import Conflict
 from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, pending_lineage
+from physworld_storage.rows import required
 from physworld_storage.tables import DatasetRow, JobRow, ShardRow
 
 
@@ -131,9 +132,7 @@ def _version_of(job: JobRow) -> tuple[str, int]:
 
 
 def _usable(session: Session, request: TrainingCreate) -> DatasetRow:
-    dataset = session.get(DatasetRow, request.dataset_id)
-    if dataset is None:
-        raise NotFound("dataset", request.dataset_id)
+    dataset = required(session, DatasetRow, request.dataset_id)
     streams = request.config.start_share < 1.0
     if dataset.state != "sealed" and not (streams and dataset.state in {"pending", "writing"}):
         needed = (

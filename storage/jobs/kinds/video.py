@@ -8,13 +8,14 @@ from pydantic import Field
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference, Unmade
+from physworld_schemas.base import Artifact, Reference
 from physworld_schemas.ids import new_id
 from physworld_schemas.video import VideoCreate, VideoReport
 from physworld_storage import videos
 from physworld_storage.errors import Conflict, NotFound
-from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, scene_row
+from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult
 from physworld_storage.registry import reference_id, resolve, version_row
+from physworld_storage.rows import required
 from physworld_storage.runs import RESULT, run_row
 from physworld_storage.tables import FitRow, JobRow, SceneRow, ShardRow, VideoRow
 
@@ -33,6 +34,7 @@ class VideoJobs(JobKind):
 
     name = "video"
     unit = "frames"
+    table = VideoRow
 
     def __init__(self) -> None:
         handler = "physworld_workers.tasks.video:run"
@@ -60,14 +62,6 @@ class VideoJobs(JobKind):
         payload |= {"scene_id": scene.id, "motion": motion, "config": config}
         return self.begin(session, job, row, payload)
 
-    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
-        """There will be no film."""
-        videos.end_video(session, output_of(job), state)
-
-    def reopen(self, session: Session, job: JobRow) -> None:
-        """The film is pending again."""
-        videos.video_row(session, output_of(job)).state = "pending"
-
     def _apply(self, session: Session, job: JobRow, shard: ShardRow, result: VideoResult) -> None:
         video_id = shard.payload["video_id"]
         videos.mark_video_ready(session, video_id, result.report, result.artifacts, result.lineage)
@@ -80,24 +74,26 @@ KIND = VideoJobs()
 def _shown(session: Session, request: VideoCreate) -> tuple[Reference, SceneRow, str | None]:
     """What is drawn, its scene, and the digest of the arrays that move; None: the recording itself."""
     if request.of == "scene":
-        scene = scene_row(session, request.id)
+        scene = required(session, SceneRow, request.id)
         return Reference(kind="scene", id=scene.id, digest=scene.digest), scene, None
     if request.of == "fit":
-        fit = session.get(FitRow, request.id)
-        if fit is None:
-            raise NotFound("fit", request.id)
+        fit = required(session, FitRow, request.id)
         motion = _file(fit, f"fit {fit.id}", PREDICTION)
-        return Reference(kind="fit", id=fit.id, digest=motion), scene_row(session, fit.scene_id), motion
+        return (
+            Reference(kind="fit", id=fit.id, digest=motion),
+            required(session, SceneRow, fit.scene_id),
+            motion,
+        )
     if request.of == "rollout":
         run = run_row(session, "rollout", request.id)
         motion = _file(run, f"rollout {run.id}", RESULT["rollout"])
-        scene = scene_row(session, str(version_row(session, run.model, run.version).scene_id))
+        scene = required(session, SceneRow, str(version_row(session, run.model, run.version).scene_id))
         return Reference(kind="rollout", id=run.id, digest=motion), scene, motion
     name, _, number = request.id.partition(":")
     version = version_row(session, name, resolve(session, name, number or "latest"))
     motion = _file(version, f"version {version.version} of {name}", PREDICTION)
     known = reference_id(name, version.version)
-    scene = scene_row(session, str(version.scene_id))
+    scene = required(session, SceneRow, str(version.scene_id))
     return Reference(kind="model", id=known, digest=version.sha256), scene, motion
 
 

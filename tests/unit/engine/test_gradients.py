@@ -7,8 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+import warp as wp
 from bodies import GRAVITY, NeoHookean, RodLaw, SheetLaw, clamped_lattice, rest_nodes
 
+from physworld.engine.gradients import adjoint_kernels, adjoint_stages_kernels
 from physworld.engine.gradients.adjoint import Adjoint, RecordedRun
 from physworld.engine.gradients.adjoint_reverse import Gradient
 from physworld.engine.problem import HeldNodes, Problem
@@ -168,3 +170,12 @@ def test_derivatives_of_another_shape_are_refused() -> None:
     run, weights, _, _ = differentiated("rod")
     with pytest.raises(ValueError, match="shape"):
         run.gradient(weights[1:])
+
+
+def test_kernels_are_compiled_for_every_precision_at_once() -> None:
+    """Whatever a run keeps, its kernels are declared: one more would compile their whole module anew."""
+    differentiated("solid with friction"), differentiated("rod")
+    modules = (adjoint_kernels, adjoint_stages_kernels)
+    kernels = [found for module in modules for found in vars(module).values() if isinstance(found, wp.Kernel)]
+    declared = {kernel.key: len(kernel.overloads) for kernel in kernels if kernel.is_generic}
+    assert len(declared) == 7 and set(declared.values()) == {2}, declared

@@ -18,7 +18,7 @@ from sqlalchemy import func, select, text
 
 from physworld_schemas.fit import FitConfig
 from physworld_storage import resources
-from physworld_storage.database import MIGRATIONS, Database, newest_revision, ping
+from physworld_storage.database import MIGRATIONS, Database, newest_revision
 from physworld_storage.errors import DatabaseUnavailable
 from physworld_storage.jobs import jobs
 from physworld_storage.patience import WORKING
@@ -122,7 +122,7 @@ def test_a_reader_neither_waits_for_a_writer_nor_sees_half_of_it(work: Work, dat
     with database.session() as writer:
         jobs.create_fit(writer, scene.id, FitConfig())
         with database.reading() as reader:
-            ping(reader)
+            reader.execute(text("SELECT 1"))
             assert reader.scalar(select(func.count()).select_from(JobRow)) == 0
     with database.reading() as reader:
         assert reader.scalar(select(func.count()).select_from(JobRow)) == 1
@@ -155,10 +155,10 @@ def test_a_locked_database_is_unavailable_and_says_why(tmp_path: Path, sqlite_te
     first = Database(f"sqlite:///{path}")
     second = Database(f"sqlite:///{path}", patience=dataclasses.replace(WORKING, lock_s=0.05))
     with first.session() as holder:
-        ping(holder)
+        holder.execute(text("SELECT 1"))
         with pytest.raises(DatabaseUnavailable, match="database is locked: another writer"):
             with second.session() as session:
-                ping(session)
+                session.execute(text("SELECT 1"))
     first.dispose()
     second.dispose()
 
@@ -184,7 +184,7 @@ def test_a_server_that_is_away_is_unavailable() -> None:
     database = Database("postgresql://nobody@127.0.0.1:1/none")
     with pytest.raises(DatabaseUnavailable, match=r"127\.0\.0\.1"):
         with database.session() as session:
-            ping(session)
+            session.execute(text("SELECT 1"))
     database.dispose()
 
 
