@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.baselines.spring_fit import SpringModel, SpringSettings
 from physworld.arrays import Array
+from physworld.baselines.spring_fit import SpringModel, SpringSettings
 from physworld.scene import Scene
 from physworld_scenes.bundle import canonical_archive
 

@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.baselines import PEERS
 from benchmarks.measured.kept import fitted as kept_or_fitted
 from physworld.arrays import Array
+from physworld.baselines import PEERS
 from physworld.errors import PhysworldError
 from physworld.evaluate.baselines import BASELINES
 from physworld.evaluate.metrics import metrics, track_error

@@ -18,13 +18,13 @@ from typing import Any
 
 import warp as wp
 
-from benchmarks.baselines.spring_fit import SpringModel, SpringSettings
 from benchmarks.harness import Report, describe_machine, write_section
 from benchmarks.measured import scoring
 from benchmarks.measured.__main__ import SHARED, say
 from benchmarks.measured.kept import fitted
 from benchmarks.measured.page import mm
 from benchmarks.measured.recording import fit_twin, key_of
+from physworld.baselines.spring_fit import SpringModel, SpringSettings
 from physworld.calibrate import CalibrationConfig
 from physworld.scene import Scene
 from physworld_scenes.bundle import read_bundle

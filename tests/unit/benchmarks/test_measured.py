@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.baselines.spring_fit import SpringSettings
 from benchmarks.measured import __main__ as benchmark
 from benchmarks.measured import recording, scoring
 from benchmarks.measured.page import report
+from physworld.baselines.spring_fit import SpringSettings
 from physworld.evaluate.baselines import BASELINES
 from physworld.scene import AS_MEASURED
 from physworld_scenes.bundle import canonical_archive

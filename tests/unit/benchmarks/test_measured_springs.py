@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.baselines import fit_spring_gaus
-from benchmarks.baselines.spring_fit import SpringModel, SpringSettings
 from benchmarks.measured import kept, springs
+from physworld.baselines import fit_spring_gaus
+from physworld.baselines.spring_fit import SpringModel, SpringSettings
 from physworld_scenes.bundle import write_bundle
 from tests.tiny_scene import tiny_scene
 

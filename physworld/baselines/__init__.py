@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from benchmarks.baselines.elastic_rod import fit_elastic_rod
-from benchmarks.baselines.linear_cloth import fit_linear_cloth
-from benchmarks.baselines.phystwin import fit_phystwin
-from benchmarks.baselines.rigid_links import fit_rigid_links
-from benchmarks.baselines.spring_gaus import fit_spring_gaus
 from physworld.arrays import Array
+from physworld.baselines.elastic_rod import fit_elastic_rod
+from physworld.baselines.linear_cloth import fit_linear_cloth
+from physworld.baselines.phystwin import fit_phystwin
+from physworld.baselines.rigid_links import fit_rigid_links
+from physworld.baselines.spring_gaus import fit_spring_gaus
 from physworld.scene import Scene
 
 PEERS: dict[str, Callable[[Scene], Callable[[Scene], Array]]] = {

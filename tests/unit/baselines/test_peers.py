@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.baselines import PEERS, elastic_rod, linear_cloth, rigid_links
-from benchmarks.baselines.fitting import least_squares
 from physworld.arrays import Array
+from physworld.baselines import PEERS, elastic_rod, linear_cloth, rigid_links
+from physworld.baselines.fitting import least_squares
 from physworld.errors import CalibrationError, SceneUnsupported
 from physworld.scene import Body, Scene
 from tests.tiny_scene import tiny_scene

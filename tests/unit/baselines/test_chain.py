@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.baselines.chain import Chain, Coefficients, _Stepper
 from physworld.arrays import Array
+from physworld.baselines.chain import Chain, Coefficients, _Stepper
 from physworld.geometry.rigid import least_rotation
 
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -12,9 +12,9 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from benchmarks.baselines.spring_body import SpringBody, spring_body, springs_between
-from benchmarks.baselines.spring_steps import Gradient, Run, Springs
 from physworld.arrays import Array
+from physworld.baselines.spring_body import SpringBody, spring_body, springs_between
+from physworld.baselines.spring_steps import Gradient, Run, Springs
 from physworld.errors import CalibrationError, SceneUnsupported, SimulationError
 from physworld.scene import Scene
 

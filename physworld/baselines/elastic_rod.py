@@ -15,9 +15,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.baselines.chain import Chain, Coefficients
-from benchmarks.baselines.fitting import least_squares
 from physworld.arrays import Array
+from physworld.baselines.chain import Chain, Coefficients
+from physworld.baselines.fitting import least_squares
 from physworld.errors import SceneUnsupported
 from physworld.evaluate.baselines import constant_velocity, start_positions
 from physworld.scene import Scene

@@ -1,4 +1,4 @@
-"""Device code of :mod:`benchmarks.baselines.spring_steps`: one step of springs, dashpots and collisions."""
+"""Device code of :mod:`physworld.baselines.spring_steps`: one step of springs, dashpots and collisions."""
 
 from __future__ import annotations
 

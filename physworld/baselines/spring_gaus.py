@@ -4,7 +4,7 @@ Every mass point is joined to its nearest ones; a stiffness and a damping of its
 A spring takes the geometric mean of its ends, which keeps momentum. There is no air drag and no search of global
 numbers: the publication starts from one stiffness for all objects; here the best of a few decades, which is more than
 it has. Grips hold the material that the scene declares (the publication has a ground alone), and tracked points give
-the loss instead of pictures. Steps as in :mod:`benchmarks.baselines.spring_steps`.
+the loss instead of pictures. Steps as in :mod:`physworld.baselines.spring_steps`.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.baselines.spring_fit import Fitting, SpringModel, SpringSettings, network
-from benchmarks.baselines.spring_steps import Gradient, Springs
 from physworld.arrays import Array
+from physworld.baselines.spring_fit import Fitting, SpringModel, SpringSettings, network
+from physworld.baselines.spring_steps import Gradient, Springs
 from physworld.scene import Scene
 
 NEIGHBOURS = 24

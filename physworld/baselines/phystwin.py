@@ -1,7 +1,7 @@
 """A spring–mass twin as PhysTwin's (Jiang et al. 2025, arXiv:2503.17973), without its images.
 
 Mass points joined by springs within a radius, at most so many a point; dashpots, air drag, and impulses in collisions
-(:mod:`benchmarks.baselines.spring_steps`). Fitted in two stages to the training frames:
+(:mod:`physworld.baselines.spring_steps`). Fitted in two stages to the training frames:
 
 1. CMA-ES over global numbers: stiffness, dashpot, drag, radius, most neighbours; elasticity and friction at a
    ground where the scene has one; those of the body against itself, and its distance, where it touches itself.
@@ -20,10 +20,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.baselines.spring_body import SpringBody
-from benchmarks.baselines.spring_fit import Fitting, SpringModel, SpringSettings, network
-from benchmarks.baselines.spring_steps import Springs
 from physworld.arrays import Array
+from physworld.baselines.spring_body import SpringBody
+from physworld.baselines.spring_fit import Fitting, SpringModel, SpringSettings, network
+from physworld.baselines.spring_steps import Springs
 from physworld.errors import CalibrationError
 from physworld.scene import Scene
 

@@ -16,9 +16,9 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.baselines.chain import Chain, Coefficients
-from benchmarks.baselines.fitting import least_squares
 from physworld.arrays import Array
+from physworld.baselines.chain import Chain, Coefficients
+from physworld.baselines.fitting import least_squares
 from physworld.errors import SceneUnsupported
 from physworld.evaluate.baselines import start_positions
 from physworld.geometry.rigid import rigid_groups, rigid_motion

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.baselines import fit_phystwin, fit_spring_gaus, phystwin
-from benchmarks.baselines.phystwin import Number
-from benchmarks.baselines.spring_body import SpringBody, spring_body, springs_between
-from benchmarks.baselines.spring_fit import Fitting, SpringModel, SpringSettings, network
-from benchmarks.baselines.spring_steps import SHORTEST_S, Gradient, Run, Springs
 from physworld.arrays import Array
+from physworld.baselines import fit_phystwin, fit_spring_gaus, phystwin
+from physworld.baselines.phystwin import Number
+from physworld.baselines.spring_body import SpringBody, spring_body, springs_between
+from physworld.baselines.spring_fit import Fitting, SpringModel, SpringSettings, network
+from physworld.baselines.spring_steps import SHORTEST_S, Gradient, Run, Springs
 from physworld.errors import SceneUnsupported, SimulationError
 from physworld.scene import DeclaredCollider, Scene
 from tests.tiny_scene import tiny_scene

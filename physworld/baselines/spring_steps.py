@@ -19,9 +19,9 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
-from benchmarks.baselines import spring_kernels
-from benchmarks.baselines.spring_body import SpringBody
 from physworld.arrays import Array
+from physworld.baselines import spring_kernels
+from physworld.baselines.spring_body import SpringBody
 from physworld.errors import SimulationError
 
 DEVICE = "cpu"

@@ -20,8 +20,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.baselines.fitting import least_squares
 from physworld.arrays import Array
+from physworld.baselines.fitting import least_squares
 from physworld.errors import SceneUnsupported
 from physworld.evaluate.baselines import start_positions
 from physworld.scene import Scene
