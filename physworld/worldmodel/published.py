@@ -174,6 +174,8 @@ class PublishedModel:
         if spec.current_neighbours:
             whole["graph.current_neighbours"] = np.array([spec.current_neighbours])
         network = {name: value.numpy(force=True) for name, value in self.model.state_dict().items()}
+        if np.any(network.get("prior.natural", 0.0)):
+            network[_COILED] = network.pop("prior.curve")
         return (
             {name: np.ascontiguousarray(value) for name, value in network.items()}
             | {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in single.items()}
@@ -234,6 +236,8 @@ class PublishedModel:
         if "prior.spread" in tensors:  # chains of earlier versions are straight
             held = straight(len(tensors["prior.mass"]))
             tensors = {f"prior.{name}": value for name, value in held.items()} | tensors
+        if _COILED in tensors:
+            tensors = {"prior.curve" if name == _COILED else name: value for name, value in tensors.items()}
         names = WorldModelConfig.__dataclass_fields__
         config = WorldModelConfig(**{name: facts[name] for name in names})
         current = int(tensors["graph.current_neighbours"][0]) if config.near_edges == "current" else 0
@@ -268,6 +272,9 @@ class PublishedModel:
         )
 
 
+_COILED = (
+    "prior.coiled_curve"  # ``prior.curve`` of a coiled chain: a reader that does not know of coils finds none
+)
 _FACTS_BEFORE = {"near_edges": "material"}  # what versions were that do not say it
 
 

@@ -26,6 +26,9 @@ class Chain:
         held = {
             name[6:]: value.astype(np.float64) for name, value in tensors.items() if name.startswith("prior.")
         }
+        held.setdefault(
+            "curve", held.get("coiled_curve", np.zeros((0, 0)))
+        )  # so named where the chain is coiled
         self._held = held
         self._substeps = int(held["substeps"][0])
         self._free = (held["member"].sum(axis=1) == 0).astype(np.float64)[:, None]

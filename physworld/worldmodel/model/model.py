@@ -48,7 +48,8 @@ where s = t+1 takes c^{t+1}.
     x̂_i^{t+1} = c̄^{t+1} + prior.mean_i + Σ_r a_r^{t+1} prior.basis[r, i]
 
 **Chain prior**, of ropes, in place of the modal one: ``physworld.worldmodel.priors.chain`` has its equations; its
-tensors are ``prior.`` and the fields of ``ChainPrior``, float32, and prior.substeps (1,) int64.
+tensors are ``prior.`` and the fields of ``ChainPrior``, float32, and prior.substeps (1,) int64. Where prior.natural is
+not 0, prior.curve is named prior.coiled_curve.
 
 **No prior**: ``physworld.worldmodel.model.inertia``; prior.lags (2,) in place of the modal prior's tensors.
 

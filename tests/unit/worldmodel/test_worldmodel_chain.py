@@ -200,6 +200,23 @@ def test_a_chain_of_an_earlier_version_is_straight() -> None:
         assert torch.allclose(again.prior(*inputs), expected, atol=ROUND_OFF_M)
 
 
+def test_a_coiled_version_is_read_back_and_not_by_readers_of_straight_ones() -> None:
+    prior, track, n = fitted(3), rope(3)[1][0], graph(3).object_count
+    natural = 6.0 * np.random.default_rng(7).normal(size=prior.natural.shape)
+    model = WorldModel(SMALL, graph(3), Normalisation(), replace(prior, natural=natural.astype(np.float32)))
+    whole = _published(model, track)
+    tensors = whole.to_tensors()
+    assert "prior.curve" not in tensors
+    window, following = track.positions[4:7], track.positions[7, n:]
+    with torch.no_grad():
+        expected = model.step(window[:, :, None], following[:, None], track.phi[:, None])[:, 0].numpy()
+        again = PublishedModel.from_tensors(tensors, whole.facts()).model
+        read = again.step(window[:, :, None], following[:, None], track.phi[:, None])[:, 0].numpy()
+    assert np.abs(read - expected).max() < ROUND_OFF_M
+    client = Network(tensors, n).step(window.double().numpy(), following.double().numpy(), track.phi.numpy())
+    assert np.abs(client - expected).max() < AGREEMENT_M
+
+
 def test_ends_that_a_chain_does_not_have_are_refused() -> None:
     with pytest.raises(ValueError, match="segments and 1 grips"):
         replace(fitted(3), carry=np.array([[0, 0], [0, 1]]))
