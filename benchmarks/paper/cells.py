@@ -254,6 +254,9 @@ def report(runs: Runs) -> Report:
             shown = []
             for column in table.columns:
                 ours = relation(table, row, column, runs)
+                others = [one for one in table.rows if one is not row]
+                if row is reference and not any(relation(table, one, column, runs) for one in others):
+                    ours = None  # a reference that nothing is related to says nothing
                 total += 1
                 if ours is None:
                     if not row.reason:

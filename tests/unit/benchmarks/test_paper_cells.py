@@ -76,6 +76,18 @@ def test_pictures_are_related_by_recording_and_a_psnr_by_its_difference() -> Non
     assert lost is not None and lost[0] == 0.0
 
 
+def test_a_reference_counts_where_another_row_has_the_column() -> None:
+    images = {"recordings": {"beam": {"predictors": {"vmp": {"held_out": {"iou": 0.5}}}, "works": {}}}}
+    held = {key: None for key, _ in plan(list(SCENES))}
+    for other, count in ((None, 0), ("linear", 2)):
+        if other is not None:
+            images["recordings"]["beam"]["predictors"][other] = {"held_out": {"iou": 0.4}}  # type: ignore[index]
+        for of in images["recordings"]["beam"]["predictors"].values():
+            of["held_out"] |= dict.fromkeys(("psnr_db", "ssim", "lpips"))  # type: ignore[union-attr,arg-type]
+        found = cells.report(cells.Runs(held, NOTHING, images))  # type: ignore[arg-type]
+        assert found.figures["count"] == count
+
+
 def test_a_network_without_demonstrations_is_related_to_the_twin_of_its_own_run() -> None:
     table = cells.TABLES[0]
     row = next(one for one in table.rows if one.title == "GS-Dynamics")
