@@ -89,7 +89,7 @@ class Elements:
             len(self.nodes),
         )
         if callable(young_pa):
-            at = self.basis.global_coordinates().value  # (3, c, q)
+            at = np.asarray(self.basis.global_coordinates())  # (3, c, q)
             modulus = young_pa(at.reshape(3, -1).T).reshape(cells, points, 1, 1)
         else:
             modulus = np.full((1, 1, 1, 1), young_pa)
