@@ -113,10 +113,11 @@ def stretches(tracks: Array, edges: Array) -> Array:
 
 
 def unrest(tracks: Array, times: Array) -> float:
-    """Mean speed of points (T, N, 3) in the last ``STILL_S`` over that in as long a time before."""
+    """Mean speed of points (T, N, 3) in the last ``STILL_S`` over that in as long a time before; 0 where all stand."""
     speed = np.linalg.norm(np.diff(tracks, axis=0), axis=2).mean(axis=1) / np.diff(times)
     count = round(STILL_S / float(np.median(np.diff(times))))
-    return float(speed[-count:].mean() / speed[-2 * count : -count].mean())
+    late, before = float(speed[-count:].mean()), float(speed[-2 * count : -count].mean())
+    return late / before if late > 0.0 else 0.0
 
 
 def flicker(filmed: Filmed, tracks: Array, times: Array) -> float:

@@ -178,6 +178,7 @@ def test_figures_without_a_reference_see_what_is_not_physical() -> None:
     swing = np.sin(40.0 * times)[:, None, None] * np.array([0.0, 0.0, 0.01])
     fading, growing = (points + np.exp(rate * times)[:, None, None] * swing for rate in (-2.0, 2.0))
     assert interactions.unrest(fading, times) < 0.5 and interactions.unrest(growing, times) > 2.0
+    assert interactions.unrest(np.repeat(points[None], 60, axis=0), times) == 0.0
     edges = interactions.edges_of(points)
     assert interactions.stretches(points + swing, edges).max() == pytest.approx(0.0, abs=1e-9)
     torn = np.repeat(points[None], 60, axis=0)
