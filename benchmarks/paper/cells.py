@@ -3,8 +3,9 @@
 A cell of the paper is a figure of other scenes, so it stands here as a relation: the row over the table's reference
 row, the paper's and ours, ours as the geometric mean over scenes (and seeds). Both sides of a relation of ours come
 from one run: world models and their twin from the cells of :mod:`benchmarks.paper.tables`, spring–mass networks and
-their twin from the JSON of :mod:`benchmarks.measured.springs`. Nothing is measured here. Below a table stands, for
-every group of cells that is not there, why; the first line counts those that are.
+their twin from the JSON of :mod:`benchmarks.measured.springs`, all image columns and the stages of the calibration from
+the JSON of :mod:`benchmarks.paper.images`. Nothing is measured here. Below a table stands, for every group of cells
+that is not there, why; the first line counts those that are.
 """
 
 from __future__ import annotations
@@ -26,8 +27,11 @@ from benchmarks.paper.tables import Cells, plan
 
 RECORDS = Path(__file__).resolve().parents[1] / "records"
 ERRORS = {"CD": "chamfer_phystwin_m", "Track": "track_m"}
-PICTURES = ("IoU", "PSNR", "SSIM", "LPIPS")
-OF_PICTURES = "no splat of our scenes is fitted and rendered by a predictor yet"
+PICTURES = {"IoU": "iou", "PSNR": "psnr_db", "SSIM": "ssim", "LPIPS": "lpips"}
+OF_PICTURES = (
+    "their films were not measured (`benchmarks.paper.images`; LPIPS asks for its package of weights)"
+)
+COLUMNS = ("CD", "Track", *PICTURES, "FPS")
 FINE_TUNED, WITHOUT = "world_model_finetuned", "world_model"
 
 
@@ -38,15 +42,16 @@ class Row:
     Attributes:
         title: as in the paper.
         figures: by column.
-        ours: our name of it, or None; the springs' JSON is asked where ``springs``.
-        springs: from which run.
+        ours: our name of it, or None.
+        source: the run that CD, Track and FPS are from: "tables", "springs" or "images"; pictures are always from the
+            last.
         reason: why there is none.
     """
 
     title: str
     figures: Mapping[str, float]
     ours: str | None
-    springs: bool = False
+    source: str = "tables"
     reason: str = ""
 
 
@@ -64,28 +69,22 @@ class Table:
         return tuple(self.rows[0].figures)
 
 
-def _row(title: str, figures: str, ours: str | None, springs: bool = False, reason: str = "") -> Row:
+def _row(title: str, figures: str, ours: str | None, source: str = "tables") -> Row:
     values = [float(value) for value in figures.split()]
     names = ("CD", "Track", *PICTURES, "FPS")[: len(values)]
-    return Row(title, dict(zip(names, values, strict=True)), ours, springs, reason)
+    return Row(title, dict(zip(names, values, strict=True)), ours, source)
 
 
 _OURS = "0.0100 0.0154 78.66 24.666 0.921 0.067"
-_LOCAL = (
-    "measured by `benchmarks.verification.ablation_local` ([gradients.md](gradients.md)), on a made bar, a beam and a "
-    "cloth, without Chamfer"
+_VIDEO = (
+    "scores of VBench, which judges films by networks that are not here; none of our figures bears these names, those "
+    "of unseen interactions stand under their own in the table of `benchmarks.paper.interactions`"
 )
-_FILMS = (
-    "a graph network that learns from films of many interactions with an object; here an object has one or two "
-    "recordings"
-)
-_VIDEO = "scores of VBench, which judges films by networks that are not here; none of our figures bears these names"
 TABLES = (
     Table("1: prediction", "Our MPM", (
-        _row("Spring-Gaus", "0.062 0.094 46.4 22.488 0.924 0.113 2", "spring_gaus", springs=True),
-        _row("GS-Dynamics", "0.041 0.070 49.8 22.540 0.924 0.097 236", None,
-             reason=_FILMS),
-        _row("PhysTwin", "0.012 0.022 72.5 25.617 0.941 0.055 17", "phystwin", springs=True),
+        _row("Spring-Gaus", "0.062 0.094 46.4 22.488 0.924 0.113 2", "spring_gaus", "springs"),
+        _row("GS-Dynamics", "0.041 0.070 49.8 22.540 0.924 0.097 236", "recording_no_prior", "images"),
+        _row("PhysTwin", "0.012 0.022 72.5 25.617 0.941 0.055 17", "phystwin", "springs"),
         _row("Our MPM", "0.011 0.021 74.7 26.231 0.942 0.052 3", "twin"),
         _row("Our GNN w/o Finetuning", "0.012 0.025 70.0 25.345 0.939 0.059 799", WITHOUT),
         _row("PhysWorld", "0.010 0.021 73.3 25.940 0.941 0.055 799", FINE_TUNED),
@@ -95,10 +94,11 @@ TABLES = (
         for title, figures in (("PhysTwin", (0.4315, 0.9971, 0.9155)), ("PhysWorld", (0.4440, 0.9973, 0.9312)))
     )),
     Table("3: global and local properties", "Global-to-Local", tuple(
-        _row(title, figures, None, reason=_LOCAL)
-        for title, figures in (
-            ("Global", "0.012 0.024 72.4 25.854 0.940 0.055"), ("Local", "0.016 0.032 66.5 24.901 0.935 0.066"),
-            ("Global-to-Local", "0.010 0.021 74.7 26.231 0.942 0.052"),
+        _row(title, figures, ours, "images")
+        for title, figures, ours in (
+            ("Global", "0.012 0.024 72.4 25.854 0.940 0.055", "twin"),
+            ("Local", "0.016 0.032 66.5 24.901 0.935 0.066", "local"),
+            ("Global-to-Local", "0.010 0.021 74.7 26.231 0.942 0.052", "global_to_local"),
         )
     )),
     Table("4: motion", "VMP-Gen", (
@@ -125,19 +125,49 @@ def main() -> int:
         "--cells", type=Path, default=RECORDS / "paper_tables", help="of benchmarks.paper.tables"
     )
     parser.add_argument("--springs", type=Path, default=RECORDS / "measured_springs.json")
+    parser.add_argument("--images", type=Path, default=RECORDS / "paper_images.json")
     parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose section is replaced")
     given = parser.parse_args()
-    for path in (given.cells, given.springs):
+    for path in (given.cells, given.springs, given.images):
         if not path.exists():
             print(f"{path}: not there", file=sys.stderr)
             return 2
     cells = Cells(given.cells, None)
     held = {key: cells.get(key) for key, _ in plan(list(SCENES))}
-    shown = report(held, json.loads(given.springs.read_text()))
+    shown = report(Runs(held, *(json.loads(path.read_text()) for path in (given.springs, given.images))))
     print(shown.markdown())
     if given.docs is not None:
         write_section(shown, given.docs)
     return 0
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What was measured.
+
+    Attributes:
+        tables: cells of ``benchmarks.paper.tables`` by key, None where one was not run.
+        springs: JSON of ``benchmarks.measured.springs``.
+        images: JSON of ``benchmarks.paper.images``.
+    """
+
+    tables: dict[str, dict[str, Any] | None]
+    springs: dict[str, Any]
+    images: dict[str, Any]
+
+    def values(self, source: str, row: Row, column: str) -> dict[str, float]:
+        """Our figure of a row by what its reference has too: scene and seed, or recording; empty where there is none.
+
+        Args:
+            source: the run.
+            row: whose figure.
+            column: which.
+        """
+        if column in PICTURES or source == "images":
+            return of_images(self.images, str(row.ours), column)
+        if source == "springs":
+            return of_springs(self.springs, str(row.ours), column)
+        return values_of(self.tables, row, column)
 
 
 def values_of(held: dict[str, dict[str, Any] | None], row: Row, column: str) -> dict[str, float]:
@@ -160,53 +190,89 @@ def of_springs(document: dict[str, Any], ours: str, column: str) -> dict[str, fl
     return {name: of[key] for name, of in found.items() if of is not None and of["reason"] is None}
 
 
-def relation(
-    table: Table, row: Row, column: str, held: dict[str, dict[str, Any] | None], springs: dict[str, Any]
-) -> tuple[float, int | None, int] | None:
-    """Ours over the reference row's: geometric mean, in how many pairs it lies on the paper's side of 1, pairs.
+def of_images(document: dict[str, Any], ours: str, column: str) -> dict[str, float]:
+    """Our figure of a prediction of the images' run by recording, on held-out frames, where it has one."""
+    found: dict[str, float] = {}
+    for name, entry in document["recordings"].items():
+        if column == "FPS":
+            of_network = entry["works"].get("recording_no_prior", {})
+            key = "twin_steps_per_second" if ours == "twin" else "own_steps_per_second"
+            if key in of_network:
+                found[name] = of_network[key]
+        elif ours in entry["predictors"]:
+            of = entry["predictors"][ours]
+            value = of["held_out"][PICTURES[column]] if column in PICTURES else of[ERRORS[column]]
+            if value is not None:
+                found[name] = value
+    return found
 
-    The second is None where the paper's relation is 1. None for a cell that is not there.
+
+def relation(table: Table, row: Row, column: str, runs: Runs) -> tuple[float, int | None, int] | None:
+    """Ours against the reference row's, in how many pairs it lies on the paper's side, pairs.
+
+    The geometric mean of the ratio; of a PSNR the mean of the difference in dB. The second is None where the paper has
+    both alike. None for a cell that is not there.
     """
     reference = next(one for one in table.rows if one.title == table.reference)
-    if row.ours is None or reference.ours is None or column not in (*ERRORS, "FPS"):
+    if row.ours is None or reference.ours is None:
         return None
-    if row.springs:
-        own, base = (of_springs(springs, name, column) for name in (row.ours, reference.ours))
-    else:
-        own, base = (values_of(held, one, column) for one in (row, reference))
-    ratios = np.array([own[key] / base[key] for key in own if key in base])
-    if not len(ratios):
+    own, base = (runs.values(row.source, one, column) for one in (row, reference))
+    pairs = [(own[key], base[key]) for key in own if key in base]
+    if not pairs:
         return None
-    paper = row.figures[column] / reference.figures[column]
-    side = int(np.sum((ratios < 1.0) == (paper < 1.0))) if paper != 1.0 else None
-    return float(np.exp(np.log(ratios).mean())), side, len(ratios)
+    apart = np.array([_apart(column, *pair) for pair in pairs])
+    paper = _apart(column, row.figures[column], reference.figures[column])
+    side = int(np.sum((apart < 0.0) == (paper < 0.0))) if paper != 0.0 else None
+    return _from_apart(column, float(apart.mean())), side, len(apart)
 
 
-def report(held: dict[str, dict[str, Any] | None], springs: dict[str, Any]) -> Report:
+def _apart(column: str, own: float, base: float) -> float:
+    """The logarithm of a ratio, which is -inf for an IoU of 0; of a PSNR the difference [dB]."""
+    if column == "PSNR":
+        return own - base
+    with np.errstate(divide="ignore"):
+        return float(np.log(own / base))
+
+
+def _from_apart(column: str, apart: float) -> float:
+    return apart if column == "PSNR" else float(np.exp(apart))
+
+
+def _shown(column: str, value: float) -> str:
+    """Two decimals; a third of SSIM, whose ratios hardly leave 1; a difference with its sign."""
+    return {"PSNR": f"{value:+.1f}", "SSIM": f"{value:.3f}"}.get(column, f"{value:.2f}")
+
+
+def report(runs: Runs) -> Report:
     """Every table, the count of cells, and why the others are not there."""
     rows, missing, found = [], [], {}
-    count = total = pictures = 0
+    count = total = 0
+    unmeasured: dict[str, int] = {}
     for table in TABLES:
         reference = next(one for one in table.rows if one.title == table.reference)
         for row in table.rows:
             shown = []
             for column in table.columns:
-                ours = relation(table, row, column, held, springs)
+                ours = relation(table, row, column, runs)
+                others = [one for one in table.rows if one is not row]
+                if row is reference and not any(relation(table, one, column, runs) for one in others):
+                    ours = None  # a reference that nothing is related to says nothing
                 total += 1
-                pictures += column in PICTURES and not row.reason
                 if ours is None:
+                    if not row.reason:
+                        unmeasured[table.title] = unmeasured.get(table.title, 0) + 1
                     continue
                 count += 1
-                paper = row.figures[column] / reference.figures[column]
+                paper = _from_apart(column, _apart(column, row.figures[column], reference.figures[column]))
                 found[f"{table.title}/{row.title}/{column}"] = {
                     "ours": ours[0],
                     "paper": paper,
                     "pairs": ours[2],
                 }
                 tail = "" if ours[1] is None else f" ({ours[1]}/{ours[2]})"
-                shown.append((column, f"{paper:.2f} / {ours[0]:.2f}{tail}"))
+                shown.append((column, f"{_shown(column, paper)} / {_shown(column, ours[0])}{tail}"))
             known = dict(shown)
-            rows.append([table.title, row.title, *(known.get(name, "–") for name in ("CD", "Track", "FPS"))])
+            rows.append([table.title, row.title, *(known.get(name, "–") for name in COLUMNS)])
             if row.reason:
                 missing.append((table.title, row.title, len(table.columns), row.reason))
     groups: dict[tuple[str, str], list[tuple[str, int]]] = {}
@@ -215,13 +281,23 @@ def report(held: dict[str, dict[str, Any] | None], springs: dict[str, Any]) -> R
     notes = [
         f"{count} of {total} cells of the paper's six tables have a counterpart here.",
         "A cell: the paper's relation / ours, the row over its table's reference row (the row with 1.00 / 1.00), "
-        "ours as the geometric mean over pairs of scene and seed; in brackets in how many pairs ours lies on the "
-        "same side of 1 as the paper's. CD and Track: below 1 errs less. FPS: above 1 is faster. "
+        "ours as the geometric mean over pairs of scene and seed, PSNR as the difference in dB; in brackets in how "
+        "many pairs ours lies on the same side as the paper's. CD, Track, LPIPS: below 1 is better. IoU, SSIM, FPS: "
+        "above. "
         "The line at the end names the machine that printed this; where cells were measured stands with their tables.",
-        "World models, their twin and the network on the recording alone: small networks on "
+        "World models, their twin and the network on the recording alone, CD, Track and FPS: small networks on "
         f"{', '.join(SCENES)}, three seeds (`benchmarks.paper.tables`). Spring–mass networks: against the twin of "
-        f"their own run on {', '.join(springs['recordings'])} (`benchmarks.measured.springs`).",
-        f"Not there, {pictures} cells of {', '.join(PICTURES)} in tables 1, 4, 5 and 6: {OF_PICTURES}.",
+        f"their own run on {', '.join(runs.springs['recordings'])} (`benchmarks.measured.springs`). IoU, PSNR, SSIM, "
+        f"LPIPS, all of table 3 and of GS-Dynamics: rendered {', '.join(runs.images['recordings'])}, one seed "
+        "(`benchmarks.paper.images`).",
+        "GS-Dynamics is, in the paper's words, “a learning-based approach employing a GNN-based model to learn "
+        "dynamics from real videos”. Its row here is our graph network without a closed-form part, trained on the "
+        "tracks of the recording's training frames alone; their own network and tracker are not here. FPS there: ticks "
+        "a second of the network and of the twin.",
+        *(
+            f"Not there, table {title}, {cells} cells of rows that are: {OF_PICTURES}."
+            for title, cells in unmeasured.items()
+        ),
         *(
             f"Not there, table {title}, {sum(cells for _, cells in names)} cells of "
             f"{', '.join(name for name, _ in names)}: {reason}."
@@ -232,7 +308,7 @@ def report(held: dict[str, dict[str, Any] | None], springs: dict[str, Any]) -> R
         name="paper.cells",
         title="The paper's tables, cell by cell",
         figures={"cells": found, "count": count, "total": total},
-        header=["table", "row", "CD", "Track", "FPS"],
+        header=["table", "row", *COLUMNS],
         rows=rows,
         notes=notes,
     )

@@ -7,7 +7,7 @@ between conditions are what counts here, and every condition gets the same netwo
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -148,9 +148,28 @@ def learn(
 
 def score(case: Case, trained: TrainingResult) -> dict[str, Any]:
     """Held-out errors before and after fine-tuning, of the twin and of the baselines; speeds."""
+    paths, facts = predicted(case, trained)
+    return {**errors_of(case.scene, paths), **facts}
+
+
+def predicted(
+    case: Case,
+    trained: TrainingResult,
+    tuning: FineTuneConfig = TUNING,
+    others: Mapping[str, SceneView] | None = None,
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tracked points (T, N, 3) [m] of the world model before and after fine-tuning and of the twin; speeds.
+
+    Args:
+        case: the recording and its twin.
+        trained: the model.
+        tuning: of Φ on the training frames.
+        others: the same body under other motions by name: the twin and the fine-tuned model predict these too, under
+            ``twin@name`` and ``world_model_finetuned@name``.
+    """
     view = case.view
     phi = np.zeros((view.spec.object_count, 2))
-    tuned = fine_tune(trained.model, phi, view.recording(), view.skin, TUNING)
+    tuned = fine_tune(trained.model, phi, view.recording(), view.skin, tuning)
     controllers = view.controllers[view.first :]
     paths, seconds = {}, []
     for name, used in (("world_model", phi), ("world_model_finetuned", tuned.phi)):
@@ -160,8 +179,14 @@ def score(case: Case, trained: TrainingResult) -> dict[str, Any]:
         paths[name] = view.tracks_of(rolled)
     times = view.scene.times - view.scene.times[0]
     paths["twin"] = resample_smooth(view.twin_tracks, view.times, times)
-    return {
-        **errors_of(view.scene, paths),
+    for name, other in (others or {}).items():
+        rolled = rollout(
+            trained.model, view.spec, other.start_history, other.controllers[other.first :], tuned.phi
+        )
+        # carried by the skin of the recording: another one would have seen the motion
+        paths[f"world_model_finetuned@{name}"] = replace(other, skin=view.skin).tracks_of(rolled)
+        paths[f"twin@{name}"] = resample_smooth(other.twin_tracks, other.times, times)
+    return paths, {
         "best_step": trained.best_step,
         "validation_m": trained.best_error_m,
         "validation_prior_m": trained.prior_error_m,
@@ -180,7 +205,16 @@ def errors_of(scene: Scene, paths: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def recording_alone(case: Case, seed: int) -> dict[str, Any]:
-    """The same network trained on the recording's own training frames: its vertices are measured points."""
+    """Held-out errors of the same network trained on the recording alone."""
+    tracks, facts = learned_from_recording(case, replace(TRAINING, seed=seed))
+    return {**errors_of(case.scene, {"recording_alone": tracks}), **facts}
+
+
+def learned_from_recording(case: Case, training: TrainingConfig) -> tuple[np.ndarray, dict[str, Any]]:
+    """Tracked points (T, N, 3) [m] of a network trained on the recording's own training frames, and its speed.
+
+    Its vertices are measured points.
+    """
     scene, view = case.scene, case.view
     times = scene.times - scene.times[0]
     points = resample_smooth(filled_in(scene), times, view.times)
@@ -201,16 +235,20 @@ def recording_alone(case: Case, seed: int) -> dict[str, Any]:
     together = together - graph_origin(spec, vertices[view.first])
     phi = np.zeros((spec.object_count, 2))
     track = Track(*(_tensor(values) for values in (together, phi)))
-    trained = train([track], spec, SMALL, replace(TRAINING, seed=seed))
+    trained = train([track], spec, SMALL, training)
     states = np.unique(np.linspace(view.first, last - 1, SKIN_STATES).round().astype(int))
     skin = affine_skin(points[states], vertices[states])
     start = vertices[view.first : view.first + view.history + 1]
-    rolled = rollout(trained.model, spec, start, view.controllers[view.first :], phi)
+    seconds = []
+    for _ in range(2):
+        begun = time.perf_counter()
+        rolled = rollout(trained.model, spec, start, view.controllers[view.first :], phi)
+        seconds.append(time.perf_counter() - begun)
     ticks = skin.apply(np.concatenate([np.repeat(vertices[:1], view.first, axis=0), rolled]))
-    return {
-        **errors_of(scene, {"recording_alone": resample_smooth(ticks, view.times, times)}),
+    return resample_smooth(ticks, view.times, times), {
         "best_step": trained.best_step,
         "diverged": not bool(np.isfinite(ticks).all()),
+        "own_steps_per_second": (len(rolled) - view.history - 1) / min(seconds),
     }
 
 

@@ -58,13 +58,16 @@ class Elements:
     Args:
         counts: elements along the three axes of a box from 0 to 1.
         shape: places (N, 3) [m] of points (N, 3) of that box at rest.
+        young_pa: of the whole body, or at places (N, 3) [m] of it, (N,).
+        poisson: likewise, one for all.
+        density_kg_m3: at rest.
     """
 
     def __init__(
         self,
         counts: tuple[int, int, int],
         shape: Callable[[Floats], Floats],
-        young_pa: float,
+        young_pa: float | Callable[[Floats], Floats],
         poisson: float,
         density_kg_m3: float,
     ) -> None:
@@ -85,8 +88,15 @@ class Elements:
             (density_kg_m3 * values * self.basis.dx).sum(axis=2).T.ravel(),
             len(self.nodes),
         )
-        self.mu = young_pa / (2 * (1 + poisson))
-        self.lam = young_pa * poisson / ((1 + poisson) * (1 - 2 * poisson))
+        if callable(young_pa):
+            at = np.asarray(self.basis.global_coordinates())  # (3, c, q)
+            modulus = young_pa(at.reshape(3, -1).T).reshape(cells, points, 1, 1)
+        else:
+            modulus = np.full((1, 1, 1, 1), young_pa)
+        self._mu = modulus / (2 * (1 + poisson))
+        self._lam = modulus * poisson / ((1 + poisson) * (1 - 2 * poisson))
+        self.mu = float(self._mu.min())
+        """Of the softest part [Pa]."""
         self.fastest_rad_s = self._fastest()
 
     def forces(self, x: Floats, v: Floats, acting: Acting) -> Floats:
@@ -95,7 +105,7 @@ class Elements:
         inverse = np.linalg.inv(F)
         determinant = np.linalg.det(F)[..., None, None]
         turned = np.swapaxes(inverse, -1, -2)
-        stress = self.mu * (F - turned) + self.lam * np.log(determinant) * turned
+        stress = self._mu * (F - turned) + self._lam * np.log(determinant) * turned
         if acting.viscosity_pa_s:
             rate = self._gradient(v) @ inverse
             stress += acting.viscosity_pa_s * determinant * (rate + np.swapaxes(rate, -1, -2)) @ turned

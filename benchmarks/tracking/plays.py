@@ -1,9 +1,9 @@
 """What the cameras look at: a beam, a rope and a cloth of known material, moved by engines that are not ours.
 
 The beam is MuJoCo's flex of ``scripts/make_sample_scene.py``, the bar the same of finite elements whose modulus is
-that of the material (``benchmarks.peers.finite_elements``), in a vacuum or in air, the rope the chain of
-``scripts/make_sample_rope.py``, the cloth MuJoCo's flex of ``benchmarks.peers.flex_cloths``. A gripper of boxes
-holds them, covers what it holds, and carries an ArUco marker; a stick goes by between object and camera in the
+that of the material (``benchmarks.peers.finite_elements``), in a vacuum or in air, or soft in its middle, the rope
+the chain of ``scripts/make_sample_rope.py``, the cloth MuJoCo's flex of ``benchmarks.peers.flex_cloths``. A gripper of
+boxes holds them, covers what it holds, and carries an ArUco marker; a stick goes by between object and camera in the
 second second.
 """
 
@@ -24,6 +24,8 @@ from scripts import make_sample_rope, make_sample_scene
 
 FPS, FRAMES = 30.0, 90
 CONVERGED_PA, BAR_ELEMENTS, DRAG_PER_S = 2.85e5, (8, 2, 2), 1.0
+SOFT_LOG, SOFT_WIDTH = -1.2, 0.18
+"""Of the uneven bar: logarithm of its modulus in the middle over the ends', deviation of the dip over its length."""
 MARKER_SIDE_M = 0.05
 """Of the marker itself; the plate that it is printed on is a fifth wider on every side."""
 MARKER_ID = 7
@@ -89,14 +91,26 @@ def beam(frames: int = FRAMES) -> Play:
     return _held_beam(Surface(boundary(mesh.tetrahedra), mesh.vertices), positions, truth)
 
 
-def bar(frames: int = FRAMES, drag_per_s: float = 0.0) -> Play:
-    """The same body and motion, of quadratic elements, perhaps in air that nobody declares: a = -c v."""
+def bar(frames: int = FRAMES, drag_per_s: float = 0.0, soft_log: float = 0.0) -> Play:
+    """The same body and motion, of quadratic elements, perhaps in air that nobody declares or soft in its middle.
+
+    Args:
+        frames: T.
+        drag_per_s: c of the air's a = -c v.
+        soft_log: logarithm of the modulus in the middle of its length over that of its ends.
+    """
     from benchmarks.peers.finite_elements import Acting, Elements, record
 
     recipe = make_sample_scene.Recipe()
     low, size = np.array(recipe.corner_m), recipe.size_m
+
+    def young_pa(places: Array) -> Array:
+        along = (places[:, 0] - low[0]) / size[0]
+        modulus: Array = CONVERGED_PA * np.exp(soft_log * np.exp(-0.5 * ((along - 0.5) / SOFT_WIDTH) ** 2))
+        return modulus
+
     elements = Elements(
-        BAR_ELEMENTS, lambda unit: low + unit * size, CONVERGED_PA, recipe.poisson, recipe.density_kg_m3
+        BAR_ELEMENTS, lambda unit: low + unit * size, young_pa, recipe.poisson, recipe.density_kg_m3
     )
     held = np.flatnonzero(elements.nodes[:, 0] <= low[0] + recipe.grip_m + 1e-9)
     path = record(
@@ -111,6 +125,7 @@ def bar(frames: int = FRAMES, drag_per_s: float = 0.0) -> Play:
     truth = {
         "youngs_modulus_pa": CONVERGED_PA,
         "air_drag_per_s": drag_per_s,
+        "soft_log": soft_log,
         "note": "these elements bend 1.2 % more stiffly than 16 x 3 x 3 of them do",
     }
     return _held_beam(Surface(boundary(mesh.tetrahedra), mesh.vertices), positions, truth)
@@ -242,6 +257,7 @@ def cloth(frames: int = FRAMES) -> Play:
 PLAYS = {
     "beam": beam,
     "bar": bar,
+    "uneven_bar": partial(bar, soft_log=SOFT_LOG),
     "bar_in_air": partial(bar, drag_per_s=DRAG_PER_S),
     "rope": rope,
     "rope_in_air": partial(rope, drag_per_s=DRAG_PER_S),

@@ -104,3 +104,20 @@ def test_friction_takes_energy_and_fibres_stiffen_along_their_axis() -> None:
     assert body.forces(stretched, 0 * rate, across) == pytest.approx(
         body.forces(stretched, 0 * rate, Acting())
     )
+
+
+def test_a_modulus_may_vary_over_the_body() -> None:
+    even, told = box(), Elements(
+        (2, 1, 1), lambda unit: unit * (0.1, 0.05, 0.05), lambda places: np.full(len(places), 2e4), 0.3, 500.0
+    )  # fmt: skip
+    bent = even.nodes * [1.02, 1.0, 1.0]
+    assert told.forces(bent, 0 * bent, Acting()) == pytest.approx(even.forces(bent, 0 * bent, Acting()))
+
+    def soft_half(places: np.ndarray) -> np.ndarray:
+        return np.where(places[:, 0] > 0.05, 1e4, 2e4)
+
+    halves = Elements((2, 1, 1), lambda unit: unit * (0.1, 0.05, 0.05), soft_half, 0.3, 500.0)
+    assert halves.mu == pytest.approx(0.5 * even.mu)
+    pulls, of_even = (body.forces(bent, 0 * bent, Acting()) for body in (halves, even))
+    ends = (even.nodes[:, 0] < 1e-9, even.nodes[:, 0] > 0.1 - 1e-9)
+    assert [pulls[end, 0].sum() / of_even[end, 0].sum() for end in ends] == pytest.approx([1.0, 0.5])
