@@ -65,12 +65,12 @@ class Settings:
     frames: int = 60
     held_out_every: int = 3
     training_every: int = 9
-    episodes: int = 8
-    training: TrainingConfig = field(default_factory=lambda: replace(TRAINING, steps=20, validation_every=10))
+    episodes: int = 40
+    training: TrainingConfig = field(default_factory=lambda: replace(TRAINING, steps=200, validation_every=40))
     alone: TrainingConfig = field(
-        default_factory=lambda: replace(WITHOUT_PRIOR, steps=80, validation_every=40)
+        default_factory=lambda: replace(WITHOUT_PRIOR, steps=200, validation_every=40)
     )
-    tuning: FineTuneConfig = field(default_factory=lambda: FineTuneConfig(steps=8))
+    tuning: FineTuneConfig = field(default_factory=lambda: FineTuneConfig(steps=20))
     fit: CalibrationConfig = field(
         default_factory=lambda: CalibrationConfig(particle_budget=300, max_simulations=30)
     )
