@@ -66,7 +66,9 @@ class Settings:
     held_out_every: int = 3
     training_every: int = 9
     episodes: int = 40
-    training: TrainingConfig = field(default_factory=lambda: replace(TRAINING, steps=200, validation_every=40))
+    training: TrainingConfig = field(
+        default_factory=lambda: replace(TRAINING, steps=200, validation_every=40)
+    )
     alone: TrainingConfig = field(
         default_factory=lambda: replace(WITHOUT_PRIOR, steps=200, validation_every=40)
     )

@@ -17,7 +17,7 @@ from benchmarks.service.hostile_files.corpus import Corpus, Hostile
 from benchmarks.service.hostile_files.ledger import Cost, Ledger
 from benchmarks.service.hostile_files.traces import Traces
 from benchmarks.service.web_process import WebProcess, serving
-from physworld_services.api.parser_process import Limits
+from physworld_services.api.parser_process import limits_of
 
 ANSWER_WITHIN_S = 120.0
 CLEAR_PEAK = "5"  # into /proc/PID/clear_refs: the peak of resident memory begins anew
@@ -91,7 +91,7 @@ class Meter:
         told = [json.loads(line) for line in lines if b'"upload_read"' in line]
         lost = any(b'"parser_gone"' in line for line in lines)
         failed = not told and not 0 < status < 500
-        allowed = Limits.of(size).memory_bytes if lost or failed else 0
+        allowed = limits_of(size).memory_bytes if lost or failed else 0
         return max([allowed, *(int(line["peak_bytes"]) for line in told)])
 
 

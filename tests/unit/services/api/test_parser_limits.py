@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from physworld_services.api.parser_process import CPU_S, MEBIBYTE, MEMORY_BYTES, Limits
+from physworld_scenes.limited import MEBIBYTE, Limits
+from physworld_services.api.parser_process import CPU_S, MEMORY_BYTES, OUTPUT_BYTES, limits_of
 
 pytestmark = pytest.mark.slow
 
@@ -19,25 +20,25 @@ ROOT = Path(__file__).parents[4]
 def _under(limits: Limits, work: str) -> int:
     """Exit status of a process that imposes the limits on itself and works."""
     numbers = tuple(vars(limits).values())
-    program = f"from physworld_services.api.parser_process import Limits\nLimits(*{numbers}).impose()\n{work}"
+    program = f"from physworld_scenes.limited import Limits\nLimits(*{numbers}).impose()\n{work}"
     return subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, timeout=60
     ).returncode
 
 
 def test_processor_time_has_an_end() -> None:
-    status = _under(Limits(1, 30, MEMORY_BYTES), "while True: pass")
+    status = _under(Limits(1, 30, MEMORY_BYTES, OUTPUT_BYTES), "while True: pass")
     assert status in (-signal.SIGXCPU, -signal.SIGKILL)
 
 
 def test_waiting_has_an_end() -> None:
-    assert _under(Limits(30, 1, MEMORY_BYTES), "import time; time.sleep(30)") == -signal.SIGALRM
+    assert _under(Limits(30, 1, MEMORY_BYTES, OUTPUT_BYTES), "import time; time.sleep(30)") == -signal.SIGALRM
 
 
 def test_memory_has_an_end() -> None:
     claim = "try: bytearray({})\nexcept MemoryError: raise SystemExit(7)"
-    assert _under(Limits(30, 30, 64 * MEBIBYTE), claim.format(128 * MEBIBYTE)) == 7
-    assert _under(Limits(30, 30, 256 * MEBIBYTE), claim.format(128 * MEBIBYTE)) == 0
+    assert _under(Limits(30, 30, 64 * MEBIBYTE, OUTPUT_BYTES), claim.format(128 * MEBIBYTE)) == 7
+    assert _under(Limits(30, 30, 256 * MEBIBYTE, OUTPUT_BYTES), claim.format(128 * MEBIBYTE)) == 0
 
 
 def test_output_has_an_end(tmp_path: Path) -> None:
@@ -49,6 +50,6 @@ def test_output_has_an_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("size", "cpu_s"), [(0, CPU_S), (512 * MEBIBYTE, CPU_S + 32)])
 def test_a_long_recording_may_take_longer_than_a_small_file(size: int, cpu_s: int) -> None:
-    limits = Limits.of(size)
+    limits = limits_of(size)
     assert limits.cpu_s == cpu_s
     assert limits.memory_bytes == MEMORY_BYTES + 8 * size
