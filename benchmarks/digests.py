@@ -86,7 +86,9 @@ def of_service(client: Client, bundle: Path, particles: int, folder: Path) -> di
         model_name=bundle.name,
         fit=FitConfig(particle_budget=particles, max_simulations=SIMULATIONS),
         dataset=DatasetConfig(episodes=EPISODES, seed=SEED),
-        training=TrainingConfig(steps=STEPS, vertices=VERTICES, fine_tune_steps=8, seed=SEED),
+        training=TrainingConfig(
+            hidden=64, message_passing_steps=7, steps=STEPS, vertices=VERTICES, fine_tune_steps=8, seed=SEED
+        ),
     )
     client.jobs.wait(client.pipelines.create(body))
     version = client.models.version(bundle.name)

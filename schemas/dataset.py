@@ -27,7 +27,7 @@ class DatasetConfig(Request):
     """
 
     episodes: int = Field(
-        default=100, ge=1, le=20_000, description="How many episodes the twin demonstrates.", examples=[100]
+        default=300, ge=1, le=20_000, description="How many episodes the twin demonstrates.", examples=[300]
     )
     frames: int | None = Field(
         default=None,

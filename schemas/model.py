@@ -27,15 +27,15 @@ class TrainingConfig(Request):
     """
 
     hidden: int = Field(
-        default=64,
+        default=48,
         ge=8,
         le=1024,
         description="Width of the network's layers.",
         json_schema_extra={"unit": "units"},
-        examples=[64],
+        examples=[48],
     )
     message_passing_steps: int = Field(
-        default=7, ge=1, le=20, description="Rounds of messages along the graph's edges.", examples=[7]
+        default=3, ge=1, le=20, description="Rounds of messages along the graph's edges.", examples=[3]
     )
     history: int = Field(
         default=3,
@@ -55,12 +55,12 @@ class TrainingConfig(Request):
     )
     vertices: int = Field(default=100, ge=4, le=1000, description="Vertices of the graph.", examples=[100])
     steps: int = Field(
-        default=240,
+        default=600,
         ge=1,
         le=1_000_000,
         description="Most training steps.",
         json_schema_extra={"unit": "steps"},
-        examples=[240],
+        examples=[600],
     )
     batch_size: int = Field(default=6, ge=1, le=256, description="Rollouts of a training step.", examples=[6])
     learning_rate: float = Field(

@@ -43,7 +43,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SCENES = {"rope": "hanging_rope", "soft body": "soft_beam"}
 IMAGES = ROOT / "docs" / "images"
 HORIZON, SLOW_HORIZON = 45, 150
-MODEL = WorldModelConfig(hidden=32, vertices=60)
+MODEL = WorldModelConfig(hidden=32, message_passing_steps=7, vertices=60)
 TRAINING = TrainingConfig(steps=120)
 EPISODES, SIMULATIONS, PARTICLES = 60, 40, 800
 SEARCH = MppiConfig(horizon=HORIZON, samples=384, iterations=8)

@@ -18,7 +18,12 @@ def held_bar(hidden: int, seed: int, near_edges: str = "material") -> tuple[Worl
     axes = (np.arange(40), np.arange(8), np.arange(8))
     bar = SPACING_M * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     config = WorldModelConfig(
-        hidden=hidden, vertices=VERTICES, neighbours=7, coarse_vertices=8, near_edges=near_edges
+        hidden=hidden,
+        message_passing_steps=7,
+        vertices=VERTICES,
+        neighbours=7,
+        coarse_vertices=8,
+        near_edges=near_edges,
     )
     groups = (np.arange(CONTROLS),)
     spec = build_graph(bar, bar, bar[:CONTROLS], dt_s=1 / 30, config=config, control_groups=groups)

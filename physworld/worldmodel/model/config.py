@@ -30,8 +30,8 @@ class WorldModelConfig:
             controllers, so many of each rigid group become vertices.
     """
 
-    hidden: int = 64
-    message_passing_steps: int = 7
+    hidden: int = 48
+    message_passing_steps: int = 3
     history: int = 3
     vertices: int = 100
     neighbours: int = 10
@@ -78,7 +78,7 @@ class TrainingConfig:
         seed: of initial weights, batches and noise.
     """
 
-    steps: int = 240
+    steps: int = 600
     batch_size: int = 6
     look_ahead: int = 24
     learning_rate: float = 1e-3
