@@ -14,6 +14,7 @@ import json
 import shutil
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -207,10 +208,10 @@ def _look(given: argparse.Namespace, options: ImportOptions) -> None:
     """Print what an import would guess."""
     from physworld_scenes.importers import look_at
 
-    title, guesses, lines = look_at(_content(given.source), given.source.name, options)
+    title, found = look_at(_content(given.source), given.source.name, options)
     print(f"{given.source}: {title}; nothing was written")
-    _table(guesses)
-    for line in lines:
+    _table(found.guesses)
+    for line in found.lines:
         print(f"  {line}")
 
 
@@ -221,7 +222,7 @@ def _content(source: Path) -> bytes:
     return source.read_bytes()
 
 
-def _table(rows: list[tuple[str, str, str, str]]) -> None:
+def _table(rows: Sequence[tuple[str, str, str, str]]) -> None:
     """Guesses as columns: what, value, how, the option that says otherwise."""
     widths = [min(max(len(row[column]) for row in rows), WIDEST) for column in range(3)] if rows else []
     for row in rows:
