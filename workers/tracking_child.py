@@ -75,7 +75,7 @@ def main(folder: Path) -> int:
     except MemoryError:
         return NO_MEMORY
     except cv2.error as error:
-        if error.code == cv2.Error.StsNoMem:
+        if error.code == cv2.Error.StsNoMem or "bad_alloc" in str(error):
             return NO_MEMORY
         raise
     except OSError as error:
