@@ -350,16 +350,11 @@ def _draw(given: argparse.Namespace, followed: Followed) -> None:
 
 def _keep_pictures(folder: Path, followed: Followed) -> None:
     """What ``physworld scenes picture`` takes: splat of the first frame, first camera, and its pictures."""
-    from physworld.video import SplatConfig, SplatView
+    from physworld.video import SplatConfig
     from physworld_workers.commands.splat import fitted_splat
-    from physworld_workers.followed_pictures import write_camera, write_frames
+    from physworld_workers.followed_pictures import splat_views, write_camera, write_frames
 
-    shown = [
-        SplatView(view.camera, view.colour(0), mask, view.depth(0))
-        for view, mask in zip(followed.views, followed.masks, strict=True)
-        if mask.size
-    ]
-    fitted_splat(shown, None, SplatConfig(), folder / "splat.ply")
+    fitted_splat(splat_views(followed), None, SplatConfig(), folder / "splat.ply")
     view = followed.views[0]
     write_camera(view, folder / "camera.json")
     write_frames(view, folder / "frames.npz")
