@@ -23,6 +23,7 @@ from typing import IO, Any
 import cv2
 import numpy as np
 import pytest
+from planar_filmed import BOARD, Film
 from tracking_pictured import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, write
 
 from physworld.camera import MOST_PIXELS
@@ -345,6 +346,27 @@ def test_changed_bytes_end_in_a_scene_or_a_refusal(child: Child, sound: Files) -
     archive = packed(sound)
     for share in (0.1, 0.6, 0.99):
         assert "take.zip: " in child.follow(archive[: int(share * len(archive))])[0]
+
+
+def test_damaged_films_end_in_a_scene_or_a_refusal(child: Child, tmp_path: Path) -> None:
+    film = Film()
+    data = film.write(tmp_path / "strip.mp4", FRAMES).read_bytes()
+    box = [int(part) for part in film.box().split(",")]
+    options = {"kind": "beam", "boxes": {"0": box}, "plane": {"board": BOARD}, "points": 12}
+    options |= {"body": {"thickness_m": 0.004}}
+    assert child.follow(data, options)[0] == ""
+    sizes = data.index(b"mp4v", data.index(b"stsd")) + 28  # width and height, where the film describes itself
+    length = data.index(b"mvhd") + 16  # its clock and its length
+    claims = [data[:at] + b"\xff" * 4 + data[at + 4 :] for at in (sizes, length, length + 4)]
+    for share in (0.02, 0.3):
+        assert child.follow(data[: int(share * len(data))], options)[0]
+    claims.append(data[: int(0.9 * len(data))])  # part of the last frame, which decoders make up for
+    rng = np.random.default_rng(6)
+    for bent in (*claims, *(bytearray(data) for _ in range(6))):
+        if isinstance(bent, bytearray):
+            for at in (*rng.integers(32, 900, 2), *rng.integers(900, len(data), 2)):
+                bent[at] = int(rng.integers(256))
+        child.follow(bytes(bent), options)
 
 
 def test_large_pictures_meet_the_limit_or_become_a_scene(child: Child, sound: Files) -> None:
