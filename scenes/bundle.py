@@ -213,8 +213,16 @@ def write_bundle(scene: Scene, folder: Path | str) -> None:
 def scene_from_parts(
     declared: dict[str, Any], arrays: dict[str, Array], meshes: dict[str, SurfaceMesh] | None = None
 ) -> Scene:
-    """A ``Scene`` out of parts that have passed the validator."""
+    """A ``Scene`` out of parts that have passed the validator, or will (``checked``).
+
+    Raises:
+        SceneInvalid: the body's facts are not of their kinds.
+    """
     fields: dict[str, Any] = {}
+    try:
+        body = _body(declared.get("body") or {})
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise refused("body", str(error)[:200]) from error
     for name, array in arrays.items():
         if name in FIELD_OF_ARRAY:
             fields[FIELD_OF_ARRAY[name]] = array if name in KEPT_AS_STORED else _float64(array)
@@ -231,7 +239,7 @@ def scene_from_parts(
         train=tuple(declared["split"]["train"]),
         test=tuple(declared["split"]["test"]),
         initial_state=_state(declared["initial_state"]),
-        body=_body(declared.get("body") or {}),
+        body=body,
         ground=None if ground is None else Ground(float(ground["height_m"]), _number(ground.get("friction"))),
         grips=tuple(_grip(grip) for grip in declared.get("grips") or []),
         colliders=colliders_of(declared, meshes or {}),

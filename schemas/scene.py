@@ -104,6 +104,23 @@ class ImportGuess(Resource):
     option: str = Field(description="Field of SceneImport that says otherwise.", examples=["up"])
 
 
+class PreviewMarker(Resource):
+    """A marker of a table, or a rigid body of which it has the pose alone."""
+
+    name: str = Field(description="Its label in the file.", examples=["Hand:1"])
+    roles: list[Literal["body", "gripper"]] = Field(
+        description="What it would be taken for: either, both, or nothing.", examples=[["gripper"]]
+    )
+    rigid: bool = Field(
+        default=False, description="Whether it is a rigid body's pose, which is never on the body."
+    )
+    place_m: tuple[float, float, float] = Field(
+        description="Where it is in the scene's world, in the frame that shows most markers.",
+        json_schema_extra={"unit": "m"},
+        examples=[[0.1, 0.0, 1.2]],
+    )
+
+
 class ScenePreview(Resource):
     """What an import of a file would guess; nothing is stored."""
 
@@ -111,6 +128,15 @@ class ScenePreview(Resource):
     guesses: list[ImportGuess] = Field(default_factory=list, description="What was found.")
     lines: list[str] = Field(
         default_factory=list, description="What is left out, what speaks against a guess."
+    )
+    markers: list[PreviewMarker] = Field(
+        default_factory=list,
+        description="All of a table of at most 2000, in the file's order, those on the body in their own.",
+    )
+    axes: list[tuple[float, float, float]] = Field(
+        default_factory=list,
+        description="Directions of the file's x, y and z in the scene's world; empty without markers.",
+        examples=[[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]],
     )
 
 

@@ -193,6 +193,11 @@ class TrackingOptions(RecordingFacts):
     keep_pictures: bool = Field(
         default=False, description="Keep the first camera and its pictures beside the scene, for films."
     )
+    fit_splat: bool = Field(
+        default=False,
+        description="Fit a splat to the first pictures, which films of the scene then draw: of pictures with depth; "
+        "takes a minute or more.",
+    )
 
 
 class FirstPicture(Resource):

@@ -5,12 +5,21 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.camera import Camera
 from physworld.tracking.recording import Followed
 from physworld.tracking.view import View
+from physworld_scenes.archives import ArchiveLimits, read_arrays
+
+if TYPE_CHECKING:
+    from physworld.video import SplatView
+
+LENS = ("width", "height", "fx", "fy", "cx", "cy")
+VIEW_LIMITS = ArchiveLimits(total_bytes=4 << 30, ratio=5000.0)
 
 
 def first_and_last(followed: Followed) -> Array:
@@ -43,7 +52,7 @@ def first_and_last(followed: Followed) -> Array:
 
 def write_camera(view: View, path: Path) -> None:
     """The camera as JSON, in the form of ``physworld video --camera``."""
-    numbers = {name: getattr(view.camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    numbers = {name: getattr(view.camera, name) for name in LENS}
     facts = {**numbers, "world_to_camera": view.camera.world_to_camera.tolist()}
     path.write_text(json.dumps(facts, indent=1) + "\n")
 
@@ -57,3 +66,44 @@ def write_frames(view: View, path: Path) -> None:
             np.lib.format.write_array_header_1_0(stream, header)
             for frame in range(view.frames):
                 stream.write(np.ascontiguousarray(view.colour(frame)).tobytes())
+
+
+def splat_views(followed: Followed) -> list[SplatView]:
+    """What the cameras that see the object show of it in the first frame: a splat is fitted to them."""
+    from physworld.video import SplatView
+
+    return [
+        SplatView(view.camera, view.colour(0), mask, view.depth(0))
+        for view, mask in zip(followed.views, followed.masks, strict=True)
+        if mask.size
+    ]
+
+
+def write_views(views: list[SplatView], path: Path) -> None:
+    """Views with depth as an npz of plain numbers."""
+    arrays: dict[str, Array] = {}
+    for number, view in enumerate(views):
+        camera = [*(getattr(view.camera, name) for name in LENS), *view.camera.world_to_camera.ravel()]
+        parts = {"camera": np.array(camera), "picture": view.picture, "mask": view.mask, "depth": view.depth}
+        arrays |= {f"{name}_{number}": np.asarray(part) for name, part in parts.items()}
+    np.savez_compressed(path, allow_pickle=False, **arrays)
+
+
+def read_views(content: bytes) -> list[SplatView]:
+    """The views of ``write_views``.
+
+    Raises:
+        ArchiveRefused, KeyError, ValueError: it holds something else.
+    """
+    from physworld.video import SplatView
+
+    arrays = read_arrays(content, VIEW_LIMITS)
+    views = []
+    for number in range(sum(name.startswith("camera_") for name in arrays)):
+        facts, picture, mask, depth = (
+            arrays[f"{name}_{number}"] for name in ("camera", "picture", "mask", "depth")
+        )
+        width, height, *lens = facts[: len(LENS)].tolist()
+        camera = Camera(int(width), int(height), *lens, facts[len(LENS) :].reshape(4, 4))
+        views.append(SplatView(camera, picture, mask, depth))
+    return views

@@ -4,7 +4,8 @@ Started by ``physworld_workers.tasks.tracking``, without keys or addresses, unde
 archive, picture, film or calibration can end this process and nothing else. ``FOLDER`` holds ``upload`` and
 ``request.json`` (``file``, its name; ``options``, a ``TrackingOptions``). How far it is, is told on standard output, a
 line of JSON each: ``[done, total, message]``. Left in ``FOLDER``: ``scene.zip``, ``followed.png``, with
-``keep_pictures`` also ``camera.json`` and ``frames.npz``, and ``found.json``, the scene's facts; or its faults alone.
+``keep_pictures`` also ``camera.json`` and ``frames.npz``, with ``fit_splat`` ``views.npz``, and ``found.json``, the
+scene's facts; or its faults alone.
 """
 
 from __future__ import annotations
@@ -34,7 +35,13 @@ from physworld_scenes.limited import die_with_parent, told
 from physworld_schemas.tracking import FilmPlane, Gripper, PixelBox, TrackingOptions
 from physworld_schemas.video import MOST_FRAMES
 from physworld_workers.commands.importing_planar import board_of
-from physworld_workers.followed_pictures import first_and_last, write_camera, write_frames
+from physworld_workers.followed_pictures import (
+    first_and_last,
+    splat_views,
+    write_camera,
+    write_frames,
+    write_views,
+)
 from physworld_workers.tracking_files import (
     ARCHIVE,
     CAMERA,
@@ -48,6 +55,7 @@ from physworld_workers.tracking_files import (
     REFUSED,
     REQUEST,
     UPLOAD,
+    VIEWS,
 )
 
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -67,6 +75,8 @@ def main(folder: Path) -> int:
         _draw(folder / LOOK, followed)
         if options.keep_pictures:
             _keep(folder, followed)
+        if options.fit_splat:
+            write_views(splat_views(followed), folder / VIEWS)
         (folder / FOUND).write_text(json.dumps(facts_of(scene, warnings)))
         return 0
     except SceneInvalid as error:
@@ -75,7 +85,7 @@ def main(folder: Path) -> int:
     except MemoryError:
         return NO_MEMORY
     except cv2.error as error:
-        if error.code == cv2.Error.StsNoMem:
+        if error.code == cv2.Error.StsNoMem or "bad_alloc" in str(error):
             return NO_MEMORY
         raise
     except OSError as error:
@@ -101,6 +111,8 @@ def _tracked(folder: Path) -> tuple[Scene, list[str], Followed, TrackingOptions]
         return *read_folder(recording, known, said, tell), options
     if options.plane is None:
         raise refused("plane", "is missing: a film needs a board or a length that tells its plane and scale")
+    if options.fit_splat:
+        raise refused("fit_splat", "is of pictures with depth; films of a plane have none")
     return *read_planar(recording, known, said, _plane(options.plane, top), tell), options
 
 

@@ -6,6 +6,8 @@ from physworld_scenes.limited import Limits
 
 UPLOAD, REQUEST, FOUND = "upload", "request.json", "found.json"
 ARCHIVE, LOOK, CAMERA, FRAMES = "scene.zip", "followed.png", "camera.json", "frames.npz"
+VIEWS = "views.npz"
+"""What the first frame shows of the object, where a splat is asked for: the handler fits it."""
 GIBIBYTE = 1 << 30
 LIMITS = Limits(cpu_s=2 * 3600, wall_s=4 * 3600, memory_bytes=GIBIBYTE, output_bytes=4 * GIBIBYTE)
 MOST_KEPT_BYTES = 2 * GIBIBYTE

@@ -1,8 +1,8 @@
 """Milliseconds a frame of 640 x 480 px for splats of several sizes: carried by vertices, rendered, encoded; one thread.
 
-Beside it a plain numpy renderer, vectorised over the pixels that a Gaussian covers, with the same order, the same reach
-and the same picture to about a step of 8 bits: what one would write without a kernel. Times are the process's own CPU
-time.
+Beside it the kernel that takes a thread for every pixel, and a plain numpy renderer, vectorised over the pixels that a
+Gaussian covers, with the same order, the same reach and the same picture to about a step of 8 bits: what one would
+write without a kernel. Times are the process's own CPU time.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ import warp as wp
 
 from benchmarks.harness import Report, interleave, run_alone
 from physworld.video import Camera, GaussianCarrier, Gaussians, Renderer, encode_mp4, orbit_view
+from physworld.video.blending import blended
 from physworld.video.render import rotation_matrices
 
 SIZES = (2_000, 20_000, 100_000)
 PLAIN = 2_000  # the plain renderer's size
+BY_PIXEL = 20_000  # and that at which the kernels are compared
 VERTICES = 500
 WIDTH, HEIGHT = 640, 480
 FILM_FRAMES = 10
@@ -43,6 +45,11 @@ def measure(repeats: int, seed: int) -> Report:
     ours = renderer.render(splats[PLAIN]).rgb
     difference = float(np.abs(plain(splats[PLAIN], camera) - ours).max())
     cases["plain"] = lambda: spent_ms(lambda: plain(splats[PLAIN], camera))
+    canvas, inputs = renderer.prepared(splats[BY_PIXEL])
+    ways = {name: name == "pixels" for name in ("pixels", "rows")}
+    drawn = {name: blended(canvas, inputs, way)[0].numpy() for name, way in ways.items()}
+    for name, way in ways.items():
+        cases[name] = lambda way=way: spent_ms(lambda: blended(canvas, inputs, way))
     frames = [ours] * FILM_FRAMES
     cases["film"] = lambda: spent_ms(lambda: encode_mp4(frames, 30.0)) / FILM_FRAMES
     timings = interleave(cases, repeats)
@@ -54,6 +61,8 @@ def measure(repeats: int, seed: int) -> Report:
         figures={
             "milliseconds_per_frame": ms,
             "plain_over_ours": ratio,
+            "pixels_over_rows": ms["pixels"] / ms["rows"],
+            "largest_difference_of_pixels_and_rows": float(np.abs(drawn["pixels"] - drawn["rows"]).max()),
             "largest_difference_to_plain": difference,
         },
         header=("Gaussians", "carry, ms", "render, ms", "plain numpy, ms"),
@@ -67,6 +76,7 @@ def measure(repeats: int, seed: int) -> Report:
             for size in SIZES
         ],
         notes=(
+            f"Blending {BY_PIXEL:,} Gaussians takes {ms['rows']:.0f} ms by rows, {ms['pixels']:.0f} by pixels.",
             f"{WIDTH} x {HEIGHT} px, carried by {VERTICES} vertices; encoding H.264 takes {ms['film']:.0f} ms a frame.",
             f"The plain renderer takes {ratio:.1f} times as long; pictures differ by {difference:.1e} of full scale.",
         ),

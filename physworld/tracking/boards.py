@@ -167,11 +167,13 @@ def _drift(seen: list[list[tuple[int, Array]]], medians: Array) -> float:
 
 
 def _pose(camera: Camera, corners: Array, pixels: Array) -> Plane:
-    """The plane of corners (K, 3) [m] that are seen at pixels (K, 2)."""
+    """The plane of corners (K, 3) [m] that are seen at pixels (K, 2). Raises TrackingFailed."""
     lens = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
     # IPPE wants its points around the origin
     middle = corners.mean(axis=0)
-    _, turn, shift = cv2.solvePnP(corners - middle, pixels, lens, None, flags=cv2.SOLVEPNP_IPPE)
+    solved, turn, shift = cv2.solvePnP(corners - middle, pixels, lens, None, flags=cv2.SOLVEPNP_IPPE)
+    if not solved:
+        raise TrackingFailed(f"the {len(corners)} corners of the board that are found tell no plane")
     turn, shift = cv2.solvePnPRefineLM(corners - middle, pixels, lens, None, turn, shift)
     projected, _ = cv2.projectPoints(corners - middle, turn, shift, lens, None)
     residual = float(np.sqrt(np.mean(np.sum((projected[:, 0] - pixels) ** 2, axis=1))))

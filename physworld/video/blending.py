@@ -20,7 +20,7 @@ from torch import Tensor
 
 from physworld.arrays import Array
 from physworld.devices import default_device
-from physworld.video.render_kernels import TILE, blend, blend_adjoint
+from physworld.video.render_kernels import TILE, blend, blend_adjoint, blend_rows
 
 _WORTH_SHARING_PX = 1 << 16
 """Pictures of fewer pixels are drawn in one piece."""
@@ -55,22 +55,27 @@ class Canvas:
         ]
 
 
-def blended(canvas: Canvas, inputs: list[Any]) -> list[Any]:
+def blended(canvas: Canvas, inputs: list[Any], by_pixel: bool | None = None) -> list[Any]:
     """Colour (H·W,) of three, coverage and sum of depths (H·W,), as Warp arrays.
 
     Args:
         canvas: what is drawn on.
         inputs: of ``Canvas.arrays``.
+        by_pixel: a thread for every pixel instead of one for a row of a tile; None: on CUDA.
     """
     pixels = canvas.width * canvas.height
     outputs = [
         wp.zeros(pixels, dtype=kind, device=canvas.device) for kind in (wp.vec3f, wp.float32, wp.float32)
     ]
-    shared = [canvas.width, -(-canvas.width // TILE), *inputs, wp.vec3f(*canvas.background), *outputs]
+    across = -(-canvas.width // TILE)
+    shared = [canvas.width, across, *inputs, wp.vec3f(*canvas.background), *outputs]
+    if wp.get_device(canvas.device).is_cuda if by_pixel is None else by_pixel:
+        wp.launch(blend, dim=pixels, inputs=shared, device=canvas.device)
+        return outputs
 
     def draw(band: tuple[int, int]) -> None:
-        first, end = band
-        wp.launch(blend, dim=end - first, inputs=[first, *shared], device=canvas.device)
+        first, end = (row * across for row in band)
+        wp.launch(blend_rows, dim=end - first, inputs=[first, *shared], device=canvas.device)
 
     bands = _bands(canvas)
     if len(bands) == 1:
@@ -83,16 +88,15 @@ def blended(canvas: Canvas, inputs: list[Any]) -> list[Any]:
 
 
 def _bands(canvas: Canvas) -> list[tuple[int, int]]:
-    """Ranges of pixels that are drawn side by side: one, but on the processor one a core, each of whole rows of tiles.
+    """Ranges of rows of pixels that are drawn side by side on the processor: one a core, each of whole rows of tiles.
 
     A kernel on the processor runs in the thread that launches it, and leaves the interpreter to the others.
     """
     rows = -(-canvas.height // TILE)
     count = 1
-    if not wp.get_device(canvas.device).is_cuda and canvas.width * canvas.height >= _WORTH_SHARING_PX:
+    if canvas.width * canvas.height >= _WORTH_SHARING_PX:
         count = min(len(os.sched_getaffinity(0)), _MOST_BANDS, rows)
-    ends = [TILE * canvas.width * (rows * k // count) for k in range(count)]
-    return list(pairwise([*ends, canvas.width * canvas.height]))
+    return list(pairwise([*(TILE * (rows * k // count) for k in range(count)), canvas.height]))
 
 
 class Blend(torch.autograd.Function):

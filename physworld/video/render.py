@@ -8,6 +8,7 @@ from the camera.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,6 +65,16 @@ class Renderer:
         Raises:
             ValueError: so many large splats that their tiles do not fit the memory.
         """
+        canvas, inputs = self.prepared(gaussians, turn)
+        shape = (canvas.height, canvas.width)
+        rgb, alpha, far = (output.numpy() for output in blended(canvas, inputs))
+        covered = np.where(alpha > 0, alpha, 1.0)
+        return Picture(
+            np.clip(rgb, 0, 1).reshape(*shape, 3), alpha.reshape(shape), (far / covered).reshape(shape)
+        )
+
+    def prepared(self, gaussians: Gaussians, turn: Array | None = None) -> tuple[Canvas, list[Any]]:
+        """What ``blended`` takes of a frame; see ``render``."""
         camera = self.camera
         with torch.no_grad():
             seen = project(
@@ -75,12 +86,8 @@ class Renderer:
         centre, conic, depth = (tensor.numpy() for tensor in (seen.centre, seen.conic, seen.depth))
         starts, order = tiles(centre, seen.reach, depth, seen.good, camera.width, camera.height)
         canvas = Canvas(camera.width, camera.height, starts, order, self.background, self.device)
-        inputs = canvas.arrays(centre, conic, gaussians.opacities, self._colours(gaussians, turn), depth)
-        shape = (camera.height, camera.width)
-        rgb, alpha, far = (output.numpy() for output in blended(canvas, inputs))
-        covered = np.where(alpha > 0, alpha, 1.0)
-        return Picture(
-            np.clip(rgb, 0, 1).reshape(*shape, 3), alpha.reshape(shape), (far / covered).reshape(shape)
+        return canvas, canvas.arrays(
+            centre, conic, gaussians.opacities, self._colours(gaussians, turn), depth
         )
 
     def _colours(self, gaussians: Gaussians, turn: Array | None) -> Array:

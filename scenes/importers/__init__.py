@@ -12,7 +12,7 @@ from physworld_scenes.archives import is_tar, is_zip
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import film, phystwin, pictures
-from physworld_scenes.importers.options import FolderImporter, Importer, ImportOptions
+from physworld_scenes.importers.options import FolderImporter, Importer, ImportOptions, Looked
 from physworld_scenes.importers.tables.forms import FORMS, NPZ, PLAIN
 from physworld_schemas.base import FieldError
 
@@ -59,10 +59,8 @@ def import_any(
     return importer_of(data, path.name, options).read(data, path.stem or "scene", options)
 
 
-def look_at(
-    data: bytes, filename: str = "", options: ImportOptions | None = None
-) -> tuple[str, list[tuple[str, str, str, str]], list[str]]:
-    """What an import would guess: the form's title, (what, value, how, option) of each guess, what is left out.
+def look_at(data: bytes, filename: str = "", options: ImportOptions | None = None) -> tuple[str, Looked]:
+    """The form's title, and what an import would guess.
 
     Args:
         data, filename, options: as of ``import_any``.
@@ -72,8 +70,8 @@ def look_at(
     """
     path = PurePosixPath(filename.replace("\\", "/"))
     importer = importer_of(data, path.name, options)
-    guesses, lines = ([], []) if importer.look is None else importer.look(data, path.stem or "scene", options)
-    return importer.title, guesses, lines
+    look = importer.look
+    return importer.title, Looked() if look is None else look(data, path.stem or "scene", options)
 
 
 def importer_of(data: bytes, name: str = "", options: ImportOptions | None = None) -> Importer:

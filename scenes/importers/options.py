@@ -58,6 +58,24 @@ class ImportOptions:
 
 
 @dataclass(frozen=True)
+class Looked:
+    """What an import would guess.
+
+    Attributes:
+        guesses: what, value, how, and the option that says otherwise.
+        lines: of what is left out, and what speaks against a guess.
+        markers: name, roles (``body``, ``gripper``, both or none), whether it is a rigid body's pose, and place [m]
+            in the scene's world, of each.
+        axes: directions of the file's x, y and z in the scene's world, 3 × 3; without markers none.
+    """
+
+    guesses: tuple[tuple[str, str, str, str], ...] = ()
+    lines: tuple[str, ...] = ()
+    markers: tuple[tuple[str, tuple[str, ...], bool, tuple[float, float, float]], ...] = ()
+    axes: tuple[tuple[float, float, float], ...] = ()
+
+
+@dataclass(frozen=True)
 class Importer:
     """A form of recording.
 
@@ -68,8 +86,7 @@ class Importer:
         recognises: whether the bytes of a file of that name are of this form; the first importer that says so reads it.
         read: bytes, the scene's name where the file has none, and options, to the scene and its warnings. Raises
             SceneInvalid, with every fault.
-        look: likewise, to what would be guessed: what, value, how, the option that says otherwise; and lines of what is
-            left out. None: of this form nothing is guessed.
+        look: likewise, to what would be guessed. None: of this form nothing is.
     """
 
     name: str
@@ -78,9 +95,7 @@ class Importer:
     help: str
     recognises: Callable[[bytes, str], bool]
     read: Callable[[bytes, str, ImportOptions | None], tuple[Scene, list[str]]]
-    look: (
-        Callable[[bytes, str, ImportOptions | None], tuple[list[tuple[str, str, str, str]], list[str]]] | None
-    ) = None
+    look: Callable[[bytes, str, ImportOptions | None], Looked] | None = None
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,8 @@ MOST_FILE_BYTES = 256 << 20
 MOST_FILM_BYTES = 1 << 30
 """Of a film, decoded."""
 MILLIMETRES = 1000.0
+FARTHEST_M = 1000.0
+"""Depth beyond it is none."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,9 @@ def frames_in(folder: Path) -> list[Path]:
 def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
     """Order of names by the numbers in them: 2 before 10."""
     parts = re.findall(r"\d+|\D+", path.stem)
-    return [(int(part), "") if part.isdigit() and len(part) < 19 else (-1, part) for part in parts], path.name
+    return [
+        (int(part), "") if part.isdecimal() and len(part) < 19 else (-1, part) for part in parts
+    ], path.name
 
 
 def size_of(path: Path, content: bytes | None = None) -> tuple[int, int]:
@@ -240,8 +244,9 @@ def _depth(path: Path, shape: tuple[int, int], scale: float | None) -> Array:
     if values.shape != shape:
         raise refused(path.name, f"has shape {values.shape}, colours have {shape}")
     whole = values.dtype.kind in "iu"
-    metres = values.astype(np.float32) / np.float32(scale or (MILLIMETRES if whole else 1.0))
-    metres[~np.isfinite(metres) | (metres < 0.0)] = 0.0
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        metres = values.astype(np.float32) / np.float32(scale or (MILLIMETRES if whole else 1.0))
+    metres[~((metres >= 0.0) & (metres <= FARTHEST_M))] = 0.0
     return metres
 
 

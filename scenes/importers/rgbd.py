@@ -253,7 +253,7 @@ def mask_file(path: Path | None, camera: Camera) -> Array | None:
                     path.name, f"has {picture.size} pixels, the camera {camera.width, camera.height}"
                 )
             return np.asarray(picture.convert("L")) > 127
-    except (OSError, ValueError, SyntaxError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise refused(path.name, f"is no mask: {str(error)[:160]}") from error
 
 

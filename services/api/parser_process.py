@@ -118,12 +118,14 @@ def _read(request: dict[str, Any]) -> int:
 
 def _looked(data: bytes, filename: str, options: ImportOptions) -> dict[str, Any]:
     """What an import would guess."""
-    title, guesses, lines = look_at(data, filename, options)
-    keys = ("what", "value", "how", "option")
+    title, found = look_at(data, filename, options)
+    guess, marker = ("what", "value", "how", "option"), ("name", "roles", "rigid", "place_m")
     return {
         "importer": title,
-        "guesses": [dict(zip(keys, guess, strict=True)) for guess in guesses],
-        "lines": [line[:FAULT_CHARACTERS] for line in lines[:MOST_FAULTS]],
+        "guesses": [dict(zip(guess, row, strict=True)) for row in found.guesses],
+        "lines": [line[:FAULT_CHARACTERS] for line in found.lines[:MOST_FAULTS]],
+        "markers": [dict(zip(marker, row, strict=True)) for row in found.markers],
+        "axes": found.axes,
     }
 
 

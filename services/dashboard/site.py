@@ -7,7 +7,7 @@ import io
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import numpy as np
 from fastapi import Request
@@ -19,6 +19,7 @@ from physworld_scenes.bundle import bundle_from_bytes
 from physworld_scenes.declaration import KINDS
 from physworld_schemas.base import Artifact
 from physworld_schemas.library import catalogue
+from physworld_schemas.scene import Axis
 from physworld_services import guide
 from physworld_services.dashboard import text
 from physworld_services.dashboard.byte_cache import ByteCache
@@ -103,6 +104,7 @@ def environment_of_pages() -> Environment:
     environment.globals.update(
         base=BASE,
         kinds=KINDS,
+        axes=get_args(Axis),
         static=_static_url,
         guide_is_built=guide.is_built,
         lasted=text.lasted,

@@ -14,6 +14,7 @@ import json
 import shutil
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -207,10 +208,10 @@ def _look(given: argparse.Namespace, options: ImportOptions) -> None:
     """Print what an import would guess."""
     from physworld_scenes.importers import look_at
 
-    title, guesses, lines = look_at(_content(given.source), given.source.name, options)
+    title, found = look_at(_content(given.source), given.source.name, options)
     print(f"{given.source}: {title}; nothing was written")
-    _table(guesses)
-    for line in lines:
+    _table(found.guesses)
+    for line in found.lines:
         print(f"  {line}")
 
 
@@ -221,7 +222,7 @@ def _content(source: Path) -> bytes:
     return source.read_bytes()
 
 
-def _table(rows: list[tuple[str, str, str, str]]) -> None:
+def _table(rows: Sequence[tuple[str, str, str, str]]) -> None:
     """Guesses as columns: what, value, how, the option that says otherwise."""
     widths = [min(max(len(row[column]) for row in rows), WIDEST) for column in range(3)] if rows else []
     for row in rows:
@@ -349,16 +350,11 @@ def _draw(given: argparse.Namespace, followed: Followed) -> None:
 
 def _keep_pictures(folder: Path, followed: Followed) -> None:
     """What ``physworld scenes picture`` takes: splat of the first frame, first camera, and its pictures."""
-    from physworld.video import SplatConfig, SplatView
+    from physworld.video import SplatConfig
     from physworld_workers.commands.splat import fitted_splat
-    from physworld_workers.followed_pictures import write_camera, write_frames
+    from physworld_workers.followed_pictures import splat_views, write_camera, write_frames
 
-    shown = [
-        SplatView(view.camera, view.colour(0), mask, view.depth(0))
-        for view, mask in zip(followed.views, followed.masks, strict=True)
-        if mask.size
-    ]
-    fitted_splat(shown, None, SplatConfig(), folder / "splat.ply")
+    fitted_splat(splat_views(followed), None, SplatConfig(), folder / "splat.ply")
     view = followed.views[0]
     write_camera(view, folder / "camera.json")
     write_frames(view, folder / "frames.npz")

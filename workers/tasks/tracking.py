@@ -21,16 +21,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from physworld.errors import SplatNotFitted
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.limited import environment, stopped_by
-from physworld_schemas.base import FieldError
+from physworld_schemas.base import Artifact, FieldError
 from physworld_workers import tracking_files as files
 from physworld_workers.context import HandlerResult, TaskContext
+from physworld_workers.followed_pictures import read_views
 from physworld_workers.stores import Stores
 
 ROOT = Path(__file__).parents[2]
 STAGES = {"reading": 5.0, "tracking": 50.0, "cloud": 1.0, "gripping": 35.0, "scene": 9.0}
 """Weights, as of a rendered beam of 90 pictures of 640 x 480 with a marker on its gripper."""
+FITTING = {"splat": 500.0}
+"""The same, where a splat of it is asked for."""
+SPLAT = "splat.ply"
 LOOK_S = 0.2
 ASKED_BYTES = 1 << 16
 STOPPED = {
@@ -53,7 +58,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     payload = context.lease.payload
     if "upload" not in payload:
         raise ValueError(f"{payload['file']} is no longer kept; upload it again")
-    context.plan(STAGES)
+    context.plan(STAGES | (FITTING if payload["options"].get("fit_splat") else {}))
     with _folder(context.lease.shard_id) as folder:
         with (folder / files.UPLOAD).open("wb") as file:
             for piece in stores.artifacts.open(payload["upload"]):
@@ -69,8 +74,28 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
                 context.check()
                 made.append(stores.artifacts.put_file(folder / name, name, media_type))
         facts = json.loads((folder / files.FOUND).read_text())
+        if (folder / files.VIEWS).is_file():
+            try:
+                made.append(_splat(context, stores, folder / files.VIEWS))
+            except SplatNotFitted as error:
+                facts["warnings"].append(f"no splat: {error}")
     result = {"facts": facts, "artifacts": [item.model_dump(mode="json") for item in made]}
     return HandlerResult(result, archive.sha256)
+
+
+def _splat(context: TaskContext, stores: Stores, views: Path) -> Artifact:
+    """Fit a splat to what the child saw of the first frame. Raises SplatNotFitted, Cancelled, LeaseLost."""
+    from physworld.video import SplatConfig, fit_splat, to_ply
+
+    config = SplatConfig(device=stores.settings.device)
+    context.begin("splat", "steps", config.steps)
+
+    def told(done: int, total: int, message: str) -> None:
+        context.check()
+        context.progress(done, total, "steps", f"fitting {message}")
+
+    fitted = fit_splat(read_views(views.read_bytes()), None, config, told)
+    return stores.artifacts.put_bytes(to_ply(fitted.gaussians), SPLAT, "application/x-ply")
 
 
 @contextlib.contextmanager

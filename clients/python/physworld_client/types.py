@@ -59,7 +59,7 @@ from physworld_schemas.model import (
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.plan import PlanConfig, PlanLimits, PointGoal, ShapeGoal
 from physworld_schemas.rollout import Part, Start
-from physworld_schemas.scene import ImportGuess, SceneImport
+from physworld_schemas.scene import ImportGuess, PreviewMarker, SceneImport
 from physworld_schemas.trace import Figure, FoundEffect, TraceConfig
 from physworld_schemas.tracking import FilmPlane, FirstPicture, Gripper, TrackingOptions, TrackingPreview
 from physworld_schemas.video import CameraView, VideoConfig, VideoReport, VideoScores
@@ -120,6 +120,7 @@ __all__ = [
     "PlanConfig",
     "PlanLimits",
     "PointGoal",
+    "PreviewMarker",
     "Problem",
     "Progress",
     "ProposedMotion",

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 from physworld.scene import Scene
 from physworld_scenes.importers import c3d
-from physworld_scenes.importers.options import Importer, ImportOptions
+from physworld_scenes.importers.axes import ROTATION_FROM_UP
+from physworld_scenes.importers.options import Importer, ImportOptions, Looked
 from physworld_scenes.importers.tables import arrays, logs, motive, plain, qualisys, trc, vicon
 from physworld_scenes.importers.tables.hdf5_content import is_hdf5
 from physworld_scenes.importers.tables.mcap_content import is_mcap
@@ -38,11 +39,11 @@ def form(
         given = options or ImportOptions()
         return scene_of(reading_of(read_table(data, name), name, given), name, scene_name, given)
 
-    def look(
-        data: bytes, scene_name: str, options: ImportOptions | None
-    ) -> tuple[list[tuple[str, str, str, str]], list[str]]:
+    def look(data: bytes, scene_name: str, options: ImportOptions | None) -> Looked:
         found = reading_of(read_table(data, name), name, options or ImportOptions())
-        return [(g.what, g.value, g.how, g.option) for g in found.guesses], [*found.lines, *found.warnings]
+        guesses = tuple((g.what, g.value, g.how, g.option) for g in found.guesses)
+        axes = tuple(tuple(axis) for axis in ROTATION_FROM_UP[found.up].T.tolist())
+        return Looked(guesses, (*found.lines, *found.warnings), found.markers, axes)
 
     return Importer(name, title, suffixes, help, recognises, read, look)
 

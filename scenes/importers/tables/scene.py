@@ -21,6 +21,7 @@ from physworld_scenes.importers.tables import guesses
 from physworld_scenes.importers.tables.belonging import Belonging, belonging, third_difference_noise
 from physworld_scenes.importers.tables.facts import asked_facts, chain_facts
 from physworld_scenes.importers.tables.guesses import Guess
+from physworld_scenes.importers.tables.shown import shown
 from physworld_scenes.importers.tables.swaps import lost, swapped
 from physworld_scenes.importers.tables.table import (
     METRES_PER_UNIT,
@@ -56,6 +57,7 @@ class Reading:
         warnings: what speaks against a guess.
         interpolated: samples of controllers that were not seen.
         unit, up: of the file.
+        markers: all of the file as a preview draws them (``Looked``).
     """
 
     form: str
@@ -73,6 +75,7 @@ class Reading:
     interpolated: int
     unit: str
     up: str
+    markers: tuple[tuple[str, tuple[str, ...], bool, tuple[float, float, float]], ...]
 
 
 def reading_of(table: MarkerTable, where: str, options: ImportOptions) -> Reading:
@@ -164,7 +167,7 @@ def reading_of(table: MarkerTable, where: str, options: ImportOptions) -> Readin
     times = times[first:] - times[first]
     return Reading(
         table.form, points, visible, controllers, times, fps, sigma, labels, held_labels, tuple(guessed), tuple(lines),
-        tuple(warnings), interpolated, unit, axis,
+        tuple(warnings), interpolated, unit, axis, shown(table, who, turn),
     )  # fmt: skip
 
 

@@ -31,6 +31,12 @@ def test_a_preview_says_what_would_be_guessed_and_stores_nothing(client: httpx.C
     values = {guess["option"]: guess["value"] for guess in body["guesses"]}
     assert (values["up"], values["unit"], values["fps"]) == ("y", "mm", "100 Hz")
     assert "up is guessed to be y: --up says it" in body["lines"]
+    markers = {one["name"]: one for one in body["markers"]}
+    assert (
+        len(markers) == 20 and markers["grip1"]["roles"] == ["gripper"] and markers["m1"]["roles"] == ["body"]
+    )
+    assert np.allclose(markers["grip1"]["place_m"], MOTION.gripper[0, 0], atol=1e-6)
+    assert body["axes"] == [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]  # the file's y points up
     assert len(client.get("/v1/scenes", params={"limit": 200}).json()["data"]) == before
 
 

@@ -32,7 +32,7 @@ def named(places: np.ndarray, labels: list[str], times: np.ndarray = MOTION.time
 
 
 def guessed(data: bytes, **options: Any) -> dict[str, tuple[str, str]]:
-    rows = look_at(data, "a.csv", ImportOptions(**options))[1]
+    rows = look_at(data, "a.csv", ImportOptions(**options))[1].guesses
     return {what: (value, how) for what, value, how, _ in rows}
 
 
@@ -171,11 +171,37 @@ def test_units_of_objects_of_other_sizes(metres: str, unit: str) -> None:
     assert guessed(named(scaled, labels))["unit"][0] == unit
 
 
+def test_every_marker_is_shown_with_what_it_would_be_taken_for() -> None:
+    """In the file's order but for the body's own, a rigid body without markers by its pose, too many not at all."""
+    labels, tracks = MOTION.tracks("grip{}", "m{}")
+    tracks = tracks.copy()
+    tracks[:3, 4] = np.nan  # m1 is seen from the fourth frame on
+    options = ImportOptions(controllers=("grip1", "m3"), markers=("m3", "m2", "m1"), up="z")
+    shown = {
+        name: (roles, place)
+        for name, roles, _, place in look_at(named(tracks, labels), "a.csv", options)[1].markers
+    }
+    assert list(shown) == ["grip1", "grip2", "grip3", "grip4", "m3", "m2", "m1", *labels[7:]]
+    assert [roles for roles, _ in shown.values()] == [
+        ("gripper",), (), (), (), ("body", "gripper"), ("body",), ("body",), *[()] * 13,
+    ]  # fmt: skip
+    assert np.allclose(shown["m2"][1], tracks[3, 5], atol=1e-6) and np.allclose(
+        shown["m1"][1], tracks[3, 4], atol=1e-6
+    )
+    pose = look_at(files.mcap_json(MOTION), "log.mcap")[1].markers[-1]
+    assert pose[:3] == ("/gripper/pose", ("gripper",), True) and np.allclose(
+        pose[3], MOTION.origin[0], atol=1e-6
+    )
+    many = np.repeat(tracks[5:9, 4:5], 2001, axis=1) + np.arange(2001)[:, None] * 1e-3
+    names = [f"p{i}" for i in range(2001)]
+    assert look_at(named(many, names), "a.csv", ImportOptions(controllers=("none",)))[1].markers == ()
+
+
 def test_a_convention_that_the_data_speak_against_is_warned_of() -> None:
-    title, rows, lines = look_at(files.motive(MOTION, up="z"), "take.csv")
+    title, found = look_at(files.motive(MOTION, up="z"), "take.csv")
     assert title == "OptiTrack Motive CSV"
-    assert next(row[1] for row in rows if row[0] == "up") == "y"
-    assert lines[-1] == "up is y, Motive's convention; the body hangs from its gripper along z: --up z?"
+    assert next(row[1] for row in found.guesses if row[0] == "up") == "y"
+    assert found.lines[-1] == "up is y, Motive's convention; the body hangs from its gripper along z: --up z?"
 
 
 def test_without_a_gripper_the_floor_tells_up() -> None:

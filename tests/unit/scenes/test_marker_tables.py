@@ -151,7 +151,7 @@ def test_unit_and_axis_of_plain_columns_are_guessed_from_the_data(up: str, unit:
     """The cloth hangs from its gripper, and spans half a metre."""
     data = files.columns(MOTION, up=up, unit=unit)
     assert_truth(imported(data, "tracks.csv"))
-    found = {what: (value, how) for what, value, how, _ in look_at(data, "tracks.csv")[1]}
+    found = {what: (value, how) for what, value, how, _ in look_at(data, "tracks.csv")[1].guesses}
     assert found["up"] == (up, "guessed: the body hangs from its gripper along it")
     assert found["unit"][0] == unit and "guessed: the markers span" in found["unit"][1]
 

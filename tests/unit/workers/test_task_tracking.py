@@ -21,13 +21,15 @@ import numpy as np
 import psutil
 import pytest
 from planar_filmed import BOARD, Film
-from tracking_pictured import BOTTOM, FRAMES, LEFT, RIGHT, TOP, write
+from tracking_pictured import BOTTOM, FRAMES, LEFT, NEAR_M, RIGHT, TOP, write
 
+from physworld.video import Renderer, from_ply
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_schemas.job import Job
 from physworld_schemas.scene import Scene
 from physworld_schemas.tracking import TrackingOptions
-from physworld_storage import resources
+from physworld_schemas.video import CameraView, VideoCreate
+from physworld_storage import resources, videos
 from physworld_storage.artifacts import SHA256
 from physworld_storage.clock import database_now
 from physworld_storage.jobs import jobs, leases
@@ -37,6 +39,7 @@ from physworld_workers import tracking_files
 from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.stores import Stores
 from physworld_workers.tasks import tracking as task
+from physworld_workers.tasks.video import camera_of
 
 pytestmark = pytest.mark.slow
 
@@ -71,6 +74,9 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     place = tmp_path / "tmp"
     place.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(place))
+    monkeypatch.setenv(
+        "TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "torch")
+    )  # it makes a folder where it is loaded
     yield
     assert list(place.iterdir()) == []
 
@@ -132,6 +138,38 @@ def test_an_archive_of_pictures_becomes_the_scene_that_the_command_makes(
     again = asked(stores, packed(folder), OPTIONS)
     _, again = worked(stores, runtime_with(), again)
     assert again.outputs[0].id == job.outputs[0].id  # the same content is the same scene
+
+
+def test_a_splat_of_the_first_pictures_is_what_films_draw(
+    runtime_with: RuntimeOf, stores: Stores, folder: Path
+) -> None:
+    options = OPTIONS | {"fit_splat": True, "keep_pictures": True}
+    outcome, job = worked(stores, runtime_with(), asked(stores, packed(folder), options))
+    assert outcome == "done", job.error
+    scene = scene_made(stores, job)
+    files = {item.name: stores.artifacts.read_bytes(item.sha256) for item in scene.artifacts}
+    assert sorted(files) == ["camera.json", "followed.png", "frames.npz", "scene.zip", "splat.ply"]
+    camera = camera_of(CameraView.model_validate_json(files["camera.json"]))
+    shown = Renderer(camera).render(from_ply(files["splat.ply"]))
+    plate = (slice(TOP + 4, BOTTOM - 4), slice(LEFT + 4, RIGHT - 4))
+    assert shown.alpha[plate].min() > 0.9 and np.abs(shown.depth[plate] - NEAR_M).max() < 0.01
+    with np.load(io.BytesIO(files["frames.npz"])) as kept:
+        assert (
+            np.mean((shown.rgb[plate] - kept["frames"][0][plate] / 255.0) ** 2) < 10**-2.5
+        )  # a PSNR of 25 dB
+    with stores.database.session() as session:
+        film = jobs.create_video(session, VideoCreate(of="scene", id=scene.id))
+    outcome, film = worked(stores, runtime_with(), film)
+    assert outcome == "done", film.error
+    with stores.database.reading() as session:
+        report = videos.get_video(session, film.outputs[0].id).report
+    assert report is not None and (report.drawn, report.seen_from) == ("splat", "scene")
+
+
+def test_a_splat_is_not_promised_of_a_film_without_depth(runtime_with: RuntimeOf, stores: Stores) -> None:
+    options = {"fit_splat": True, "plane": {"board": BOARD}}
+    _, job = worked(stores, runtime_with(), asked(stores, HOSTILE["film"][0], options))
+    assert job.error is not None and job.error.errors[0].loc == ["fit_splat"], job.error
 
 
 def test_progress_goes_through_the_stages(runtime_with: RuntimeOf, stores: Stores, folder: Path) -> None:

@@ -88,6 +88,9 @@ def import_recording(
     keep_pictures: Annotated[
         bool, typer.Option("--keep-pictures", help="There, keep the first camera's pictures beside it.")
     ] = False,
+    fit_splat: Annotated[
+        bool, typer.Option("--fit-splat", help="There, fit a splat to the first pictures, for films.")
+    ] = False,
     url: Url = None,
     token: Token = None,
     data: Data = None,
@@ -132,10 +135,11 @@ def import_recording(
     flags = {"--undeformed": undeformed, "--look": look, "--assume": assume}
     if service:
         with services.connect(url, token, data) as client:
-            import_there(client, source, {**given, **flags, "--keep-pictures": keep_pictures}, several)
+            there = {"--keep-pictures": keep_pictures, "--fit-splat": fit_splat}
+            import_there(client, source, {**given, **flags, **there}, several)
         return
-    if keep_pictures or any(one is not None for one in (url, token, data)):
-        raise typer.BadParameter("--keep-pictures, --url, --token and --data need --service")
+    if keep_pictures or fit_splat or any(one is not None for one in (url, token, data)):
+        raise typer.BadParameter("--keep-pictures, --fit-splat, --url, --token and --data need --service")
     options = [f"{option}={value}" for option, value in given.items() if value is not None]
     options += [f"{option}={value}" for option, values in several.items() for value in values]
     become(MODULE, [*options, *(flag for flag, given in flags.items() if given), "--", str(source)])

@@ -27,7 +27,7 @@ FACTS = {
 NOT_THERE = {
     "--out": "the service keeps the scene",
     "--look": "`physworld scenes add --preview` looks",
-    "--pictures": "--keep-pictures keeps them",
+    "--pictures": "--keep-pictures keeps them, --fit-splat fits a splat",
 }
 BESIDE = "given/{}"
 """Where files that options name lie in the archive."""
@@ -131,6 +131,7 @@ def _tracking(
         "points": given["--points"],
         "undeformed": given["--undeformed"],
         "keep_pictures": given["--keep-pictures"],
+        "fit_splat": given["--fit-splat"],
     }
     return facts | {name: value for name, value in told.items() if value not in (None, {}, False)}, files
 

@@ -59,9 +59,9 @@ export function post(form, file, options, done) {
   request.send(body);
 }
 
-/** Ask the form's address what a file holds; the answer, or null where it was told why not. */
-export async function ask(form, file, options) {
-  tell(form, `Looking at ${file.name} …`);
+/** Ask the form's address what a file holds; the answer, or null where it was told why not, unless quietly. */
+export async function ask(form, file, options, quietly = false) {
+  if (!quietly) tell(form, `Looking at ${file.name} …`);
   const body = new FormData();
   body.append("bundle", file, file.name);
   if (options) body.append("options", JSON.stringify(options));
@@ -69,9 +69,9 @@ export async function ask(form, file, options) {
     const answer = await fetch(`${form.action}/preview`, { method: "POST", body, headers: { Accept: "application/json" } });
     const found = await answer.json();
     if (answer.ok) return found;
-    tell(form, found.told ?? `The service answered ${answer.status}.`, found.faults);
+    if (!quietly) tell(form, found.told ?? `The service answered ${answer.status}.`, found.faults);
   } catch {
-    tell(form, "The service does not answer; nothing was stored.");
+    if (!quietly) tell(form, "The service does not answer; nothing was stored.");
   }
   return null;
 }

@@ -1,5 +1,5 @@
 // Uploads: a file, or a folder that is packed here, with a bar; the server's faults are shown where the file was dropped.
-// A table of markers is looked at first: what would be guessed is shown, and stored when it is confirmed.
+// A table of markers is looked at first: what would be guessed is shown and drawn, and stored when it is confirmed.
 // Without this script the form posts the file as any form does.
 
 import { zip } from "fflate";
@@ -54,9 +54,36 @@ function show(form, found) {
 /** Ask what an import would guess; the options are there for what it could not, or guessed wrongly. */
 async function look(form, file) {
   form.looked = file;
-  const found = await ask(form, file, optionsOf(form));
+  const turn = (form.turn = (form.turn ?? 0) + 1);
+  const options = optionsOf(form);
+  const found = await ask(form, file, options);
+  if (turn !== form.turn) return; // something else was clicked meanwhile
   form.querySelector("[data-options]").hidden = false;
   if (found) show(form, found);
+  const unheld = !found && form.querySelector("[data-told]").textContent.includes("--gripper");
+  const drawn = unheld ? await ask(form, file, { ...options, controllers: ["none"] }, true) : found;
+  if (turn === form.turn) await draw(form, drawn);
+}
+
+/** Draw the markers, where there are any; what is clicked in the drawing goes into the form, which is looked at again. */
+async function draw(form, found) {
+  const figure = form.querySelector("[data-markers]");
+  figure.hidden = !found?.markers.length;
+  if (figure.hidden) return;
+  try {
+    const { Markers } = await import(figure.dataset.markers);
+    form.viewer ??= new Markers(figure, (chosen) => {
+      for (const [name, value] of Object.entries(chosen)) {
+        form.querySelector(`[data-option="${name}"], [data-names="${name}"]`).value = value;
+      }
+      look(form, form.looked);
+    });
+    window.viewer = form.viewer; // for tests, which have no other way to see where a marker is drawn
+    form.viewer.draw(found);
+  } catch (error) {
+    figure.hidden = true; // no WebGL: the table and the fields say the same
+    console.warn(error);
+  }
 }
 
 function bring(form, file) {
