@@ -146,7 +146,8 @@ class SecurityHeaders:
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
                     headers.setdefault(name, value)
-                fresh = is_static and b"v=" in scope["query_string"]
+                named_by_content = b"v=" in scope["query_string"] or "/chunk-" in scope["path"]
+                fresh = is_static and named_by_content
                 headers.setdefault(
                     "Cache-Control", FOREVER if fresh else "no-cache" if is_static else "no-store"
                 )

@@ -21,6 +21,8 @@ await build({
   outdir: OUT,
   bundle: true,
   minify: true,
+  splitting: true, // three.js once for all that draw
+  chunkNames: "[name]-[hash]",
   format: "esm",
   target: ["es2022"],
   legalComments: "eof",
