@@ -103,7 +103,7 @@ def read_views(content: bytes) -> list[SplatView]:
         facts, picture, mask, depth = (
             arrays[f"{name}_{number}"] for name in ("camera", "picture", "mask", "depth")
         )
-        width, height, *lens = facts[: len(LENS)].tolist()
-        camera = Camera(int(width), int(height), *lens, facts[len(LENS) :].reshape(4, 4))
+        width, height, fx, fy, cx, cy = facts[: len(LENS)].tolist()
+        camera = Camera(int(width), int(height), fx, fy, cx, cy, facts[len(LENS) :].reshape(4, 4))
         views.append(SplatView(camera, picture, mask, depth))
     return views
