@@ -1,5 +1,5 @@
 # make demo [SCENE=path]   the main job on a scene, from a fresh machine to the results table
-# make test [JOBS=n]       everything the tests need, then linters and tests in n processes (4: half of the time they wait for services)
+# make test [JOBS=n]       everything the tests need, then linters and tests in n processes (2)
 # make test-fast           the tests that neither are slow nor need a service, in JOBS processes; no linters
 # make bench               the figures of docs/benchmarks.md
 # make up                  the embedded service in the foreground, with the guide (built where it is older than its pages)
@@ -13,7 +13,7 @@
 SHELL := /bin/bash
 SCENE ?= sample/soft_beam
 DATA ?= .demo
-JOBS ?= 4
+JOBS ?= 2
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 SITE ?= services/guide/site
