@@ -115,7 +115,7 @@ def test_a_pipeline_is_started_by_its_form_with_other_settings(visit: Visit, wor
     expect(visit.page.locator("#scene_id")).to_have_value(world.scene_id)
     visit.page.locator("summary", has_text="Dataset").click()
     episodes = visit.page.get_by_label("Episodes", exact=True)
-    expect(episodes).to_have_value("100")
+    expect(episodes).to_have_value("300")
     expect(episodes).to_have_attribute("max", "20000")
     episodes.fill("12")
     visit.page.get_by_role("button", name="Start").click()

@@ -31,7 +31,10 @@ class RefusingProxy(FrozenProxy):
         self.thaw()
 
     def _pump(self, source: socket.socket, sink: socket.socket) -> None:
-        asks = sink.getpeername()[1] == self._target[1]
+        try:
+            asks = sink.getpeername()[1] == self._target[1]
+        except OSError:  # the connection has ended meanwhile
+            asks = False
         super()._pump(_Asking(self, source) if asks else source, sink)
 
 
