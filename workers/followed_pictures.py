@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from physworld.video import SplatView
 
 LENS = ("width", "height", "fx", "fy", "cx", "cy")
-VIEW_LIMITS = ArchiveLimits(total_bytes=4 << 30, ratio=5000.0)
+VIEW_LIMITS = ArchiveLimits(total_bytes=1 << 30, ratio=5000.0)
 
 
 def first_and_last(followed: Followed) -> Array:
