@@ -27,6 +27,7 @@ from physworld.arrays import Array
 from physworld.worldmodel.dataset import graph_origin
 from physworld.worldmodel.errors import TrainingCancelled
 from physworld.worldmodel.model.config import FineTuneConfig
+from physworld.worldmodel.model.frame import turns_ahead
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.properties import PROPERTIES
 from physworld.worldmodel.model.skinning import Skin
@@ -225,8 +226,9 @@ class _Task:
         driven = self.driven[rows, :, 0].transpose(1, 2)
         shared = phi[:, None].expand(-1, len(self.segments), -1)
         ticks = list(window[:, :n])
-        for i in range(self.length):
-            moved = self.model.step(window, driven[frames + i], shared, self.constants)
+        ahead = driven[frames : frames + self.length]
+        for following, turn in zip(ahead, turns_ahead(self.model.spec.frame, ahead), strict=True):
+            moved = self.model.step(window, following, shared, self.constants, turn)
             ticks.append(moved[:n])
             window = torch.cat([window[1:], moved[None]])
         whole = torch.stack(ticks)

@@ -17,6 +17,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from physworld.worldmodel.model.frame import turns_ahead
 from physworld.worldmodel.model.model import WorldModel
 
 _WARM_UP = 2  # runs before a recording, in which what is kept on the device gets there
@@ -42,12 +43,12 @@ def unrolled_loss(model: WorldModel, window: Tensor, truth: Tensor, phi: Tensor)
     n, constants = model.spec.object_count, model.edge_constants()
     alone = window
     left = beside = window.new_zeros(window.shape[2])
-    for following in truth:
-        predicted = model.step(window, following[n:], phi, constants)
+    for following, turn in zip(truth, turns_ahead(model.spec.frame, truth[:, n:]), strict=True):
+        predicted = model.step(window, following[n:], phi, constants, turn)
         left = left + _squared(predicted[:n] - following[:n])
         window = torch.cat([window[1:], predicted[None]])
         with torch.no_grad():
-            ahead = model.prior_ahead(alone, following[n:], phi)
+            ahead = model.prior_ahead(alone, following[n:], phi, turn)
             beside = beside + _squared(ahead - following[:n])
             alone = torch.cat([alone[1:], torch.cat([ahead, following[n:]])[None]])
     return (left / (beside + len(truth) * model.norm.change.square())).mean()

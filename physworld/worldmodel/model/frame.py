@@ -39,6 +39,9 @@ ON_A_LINE = 1e-3  # second over first singular value of the shape: below it the 
 NEWTON = 12
 OPPOSITE = 1e-3  # least 1 + u · d: a line that is turned round has no least turn
 
+Turn = tuple[Tensor, Tensor]
+"""R (B, 3, 3) and c̄ (B, 3) of a step."""
+
 
 @dataclass(frozen=True)
 class GripFrame:
@@ -79,7 +82,7 @@ def grip_frame(controls: Array, gravity_m_s2: Array, dt_s: float) -> GripFrame |
     return GripFrame(shape, 0.5 * np.asarray(gravity_m_s2, dtype=np.float64) * dt_s**2, line)
 
 
-def turn_of(frame: GripFrame, controls: Tensor) -> tuple[Tensor, Tensor]:
+def turn_of(frame: GripFrame, controls: Tensor) -> Turn:
     """R (B, 3, 3) and c̄ (B, 3) of control vertices (C, B, 3)."""
     shape, _, line = frame.tensors(controls)
     centre = controls.mean(dim=0)
@@ -89,6 +92,16 @@ def turn_of(frame: GripFrame, controls: Tensor) -> tuple[Tensor, Tensor]:
         return _least_turn(seen, line), centre
     size = torch.linalg.vector_norm(seen, dim=(1, 2), keepdim=True)
     return polar(seen + cofactors(seen) / size), centre
+
+
+def turns_ahead(frame: GripFrame | None, driven: Tensor) -> list[Turn | None]:
+    """R and c̄ of every step of control vertices (T, C, B, 3), in one go; of no frame None each."""
+    if frame is None:
+        return [None] * len(driven)
+    steps, controls, batch, _ = driven.shape
+    rotation, centre = turn_of(frame, driven.transpose(0, 1).reshape(controls, steps * batch, 3))
+    pairs = zip(rotation.reshape(steps, batch, 3, 3), centre.reshape(steps, batch, 3), strict=True)
+    return list(pairs)
 
 
 def turns_of(frame: GripFrame, controls: Array) -> Array:
@@ -138,17 +151,17 @@ def _cross(left: Tensor, right: Tensor) -> Tensor:
 
 
 def enter(
-    frame: GripFrame, window: Tensor, control_next: Tensor
-) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
+    frame: GripFrame, window: Tensor, control_next: Tensor, turn: Turn | None = None
+) -> tuple[Turn, Tensor, Tensor]:
     """A window and the control vertices in the frame of that moment: (R, c̄), (h+1, V, B, 3) and (C, B, 3).
 
     Args:
         frame: which control vertices span it, and how far gravity falls in a tick.
         window: positions at t - h … t (h+1, V, B, 3) [m], world axes.
         control_next: control vertices at t + 1 (C, B, 3) [m], world axes.
-        n: object vertices.
+        turn: R and c̄ of ``control_next``, where they are known (:func:`turns_ahead`).
     """
-    rotation, centre = turn_of(frame, control_next)
+    rotation, centre = turn or turn_of(frame, control_next)
     ticks = torch.arange(1 - len(window), 1, dtype=window.dtype, device=window.device)
     fall = frame.tensors(window)[1]
     fallen = (ticks.square()[:, None] * fall)[:, None, None]
@@ -157,7 +170,7 @@ def enter(
     return (rotation, centre), local, ahead
 
 
-def leave(frame: GripFrame, turn: tuple[Tensor, Tensor], ahead: Tensor) -> Tensor:
+def leave(frame: GripFrame, turn: Turn, ahead: Tensor) -> Tensor:
     """x^{t+1} of ŷ^{t+1} (n, B, 3)."""
     rotation, centre = turn
     return torch.einsum("vbj,bij->vbi", ahead, rotation) + centre + frame.tensors(ahead)[1]

@@ -104,7 +104,7 @@ from torch import Tensor, nn
 from physworld.arrays import Array
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.features import Normalisation, Scales, vertex_features
-from physworld.worldmodel.model.frame import enter, leave
+from physworld.worldmodel.model.frame import Turn, enter, leave
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.nearest import CurrentEdges, KeptEdges
@@ -273,7 +273,12 @@ class WorldModel(nn.Module):
         return mean
 
     def step(
-        self, window: Tensor, control_next: Tensor, phi: Tensor, constants: EdgeConstants | None = None
+        self,
+        window: Tensor,
+        control_next: Tensor,
+        phi: Tensor,
+        constants: EdgeConstants | None = None,
+        turn: Turn | None = None,
     ) -> Tensor:
         """Positions of all vertices at t + 1 (V, B, 3) [m].
 
@@ -282,21 +287,24 @@ class WorldModel(nn.Module):
             control_next: where the control vertices go (C, B, 3) [m].
             phi: logarithms of property ratios (n, B, ·).
             constants: what edges share over a rollout; None computes it here.
+            turn: of the grip's frame at t + 1 (``frame.turns_ahead``); None computes it here.
         """
         n, frame = self.spec.object_count, self.spec.frame
         if frame is None:
             ahead = torch.cat([self.prior(window, control_next, phi), control_next])
             correction = self.forward(window, ahead, phi, constants)
             return torch.cat([ahead[:n] + self.norm.change * correction, control_next])
-        turn, local, control_local = enter(frame, window, control_next)
+        turn, local, control_local = enter(frame, window, control_next, turn)
         ahead = torch.cat([self.prior(local, control_local, phi), control_local])
         correction = self.forward(local, ahead, phi, constants)
         moved = leave(frame, turn, ahead[:n] + self.norm.change * correction)
         return torch.cat([moved, control_next])
 
-    def prior_ahead(self, window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
+    def prior_ahead(
+        self, window: Tensor, control_next: Tensor, phi: Tensor, turn: Turn | None = None
+    ) -> Tensor:
         """x̂^{t+1} of the object vertices in world axes [m], (n, B, 3), of the same arguments as :meth:`step`."""
-        return framed_prior(self.prior, self.spec)(window, control_next, phi)
+        return framed_prior(self.prior, self.spec)(window, control_next, phi, turn)
 
     def corrects_prior(self) -> bool:
         """Whether the network adds anything to the prior: not before the first step of training."""

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
 from physworld.arrays import Array
-from physworld.worldmodel.model.frame import enter, leave
+from physworld.worldmodel.model.frame import Turn, enter, leave
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior, InertialStep, one_step_residual
 from physworld.worldmodel.priors.chain import ChainPrior
 from physworld.worldmodel.priors.chain_step import ChainStep
 from physworld.worldmodel.priors.modal import ModalPrior
+
+
+class FramedPrior(Protocol):
+    """A prior's step in world axes."""
+
+    def __call__(self, window: Tensor, control_next: Tensor, phi: Tensor, turn: Turn | None = None) -> Tensor:
+        """x̂^{t+1} of the object vertices [m], (n, B, 3); arguments as of ``WorldModel.step``."""
+        ...
 
 
 def prior_step(
@@ -25,16 +33,16 @@ def prior_step(
     return ChainStep(prior, history) if isinstance(prior, ChainPrior) else PriorStep(prior, history)
 
 
-def framed_prior(step: nn.Module, spec: GraphSpec) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+def framed_prior(step: nn.Module, spec: GraphSpec) -> FramedPrior:
     """x̂^{t+1} in world axes by a prior's ``step``, which is taken in the grip's frame where the graph has one."""
     frame = spec.frame
 
-    def ahead(window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
+    def ahead(window: Tensor, control_next: Tensor, phi: Tensor, turn: Turn | None = None) -> Tensor:
         found: Tensor
         if frame is None:
             found = step(window, control_next, phi)
             return found
-        turn, local, control_local = enter(frame, window, control_next)
+        turn, local, control_local = enter(frame, window, control_next, turn)
         found = leave(frame, turn, step(local, control_local, phi))
         return found
 

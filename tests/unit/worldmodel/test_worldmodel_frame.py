@@ -15,7 +15,7 @@ from physworld.worldmodel import PublishedModel, affine_skin
 from physworld.worldmodel.dataset import read_track
 from physworld.worldmodel.export import example_inputs, torch_program
 from physworld.worldmodel.model.config import TrainingConfig
-from physworld.worldmodel.model.frame import GripFrame, enter, grip_frame, leave, turns_of
+from physworld.worldmodel.model.frame import GripFrame, enter, grip_frame, leave, turns_ahead, turns_of
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.priors.choose import TURNED, choose, fit_priors, prior_error, spec_for
@@ -98,6 +98,22 @@ def test_turning_the_world_about_the_vertical_turns_the_step() -> None:
         sideways = torch.as_tensor(Rotation.from_rotvec([1.0, 0.0, 0.0]).as_matrix())
         apart = (step(places @ sideways.T) - step(places) @ sideways.T).abs().max()
     assert apart > 1e-6, "gravity does not turn with the world"
+
+
+def test_turns_found_together_are_those_of_each_step() -> None:
+    model, spec = moving(), graph(framed=True)
+    places = torch.as_tensor(read_track(spec, turned_episode(3, 1.0), SMALL.history).positions).double()
+    phi, n = torch.zeros(spec.object_count, 1, 2).double(), spec.object_count
+    window, driven = places[9:12, :, None], places[12:20, n:, None]
+    turns = turns_ahead(spec.frame, driven)
+    assert len(turns) == len(driven)
+    with torch.no_grad():
+        for control_next, turn in zip(driven, turns, strict=True):
+            alone = model.step(window, control_next, phi)
+            assert (model.step(window, control_next, phi, turn=turn) - alone).abs().max() < 1e-12
+            ahead = model.prior_ahead(window, control_next, phi)
+            assert (model.prior_ahead(window, control_next, phi, turn) - ahead).abs().max() < 1e-12
+    assert turns_ahead(None, driven) == [None] * len(driven)
 
 
 def turned_episode(seed: int, angle: float) -> dict[str, np.ndarray]:
