@@ -53,8 +53,24 @@ class Gripper(Request):
     )
     log: FileName | None = Field(
         default=None,
-        description="CSV of a robot in the archive: `t,x,y,z` and, if it turns, `qw,qx,qy,qz`, in the scene's world.",
+        description="A robot's log in the archive, in the scene's world: CSV with `t,x,y,z` and, if it turns, "
+        "`qw,qx,qy,qz`; MCAP; or a parquet file of LeRobot with `info.json`, or the folder of its data set.",
         examples=["robot.csv"],
+    )
+    log_pose: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=256,
+        description="Which of several poses: a topic of MCAP, `/tf:FRAME`, or what stands before x, y and z in names of "
+        "LeRobot; null: the only one.",
+        examples=["/tool/pose"],
+    )
+    log_episode: int | None = Field(
+        default=None,
+        ge=0,
+        lt=10**9,
+        description="Which of several episodes of LeRobot; null: the only one.",
+        examples=[3],
     )
     log_delay_s: float = Field(
         default=0.0,

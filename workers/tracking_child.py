@@ -25,12 +25,13 @@ from physworld_scenes.bundle import write_archive
 from physworld_scenes.errors import SceneInvalid, refused
 from physworld_scenes.facts import facts_of
 from physworld_scenes.importers.gripping import GripFrom
+from physworld_scenes.importers.library import limit_here
 from physworld_scenes.importers.options import ImportOptions
 from physworld_scenes.importers.pictures import is_pictures
 from physworld_scenes.importers.planar.place import PlaneFrom
 from physworld_scenes.importers.planar.reading import read_planar
 from physworld_scenes.importers.rgbd import PictureOptions, read_folder
-from physworld_scenes.importers.unpacked import file_in, unpacked
+from physworld_scenes.importers.unpacked import file_in, log_in, unpacked
 from physworld_scenes.limited import die_with_parent, told
 from physworld_schemas.tracking import FilmPlane, Gripper, PixelBox, TrackingOptions
 from physworld_schemas.video import MOST_FRAMES
@@ -67,6 +68,7 @@ def main(folder: Path) -> int:
 
     die_with_parent()
     LIMITS.impose()
+    limit_here()
     tempfile.tempdir = str(folder)
     try:
         scene, warnings, followed, options = _tracked(folder)
@@ -140,7 +142,9 @@ def _grip(gripper: Gripper, top: Path) -> GripFrom:
         dictionary=gripper.dictionary,
         patch=box(gripper.patch),
         colour=gripper.colour,
-        log=None if gripper.log is None else file_in(top, gripper.log),
+        log=None if gripper.log is None else log_in(top, gripper.log),
+        log_pose=gripper.log_pose,
+        log_episode=gripper.log_episode,
         log_delay_s=gripper.log_delay_s,
         held_px=box(gripper.held_px),
         held_m=gripper.held_m,

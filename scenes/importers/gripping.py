@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +18,12 @@ from physworld.tracking.recording import Followed, patch_points
 from physworld.tracking.rigid import RigidPath, rigid_path
 from physworld.tracking.view import View, cloud_of
 from physworld_scenes.errors import refused
+from physworld_scenes.importers.robot.log import read_log
 
 GRIP_MARGIN_M = 0.01
 REACH_SHARE = 0.1
 """Of the object's size, beyond the nearest point: what a gripper holds where nobody says."""
 LEAST_HELD_PX = 4
-MOST_LOG_BYTES = 64 << 20
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,9 @@ class GripFrom:
         dictionary: of the marker.
         patch: a box on it in the first camera's first picture: its texture is followed.
         colour: column and row of a pixel of its colour there; such a gripper does not turn.
-        log: CSV of a robot with a head: t, x, y, z and, if it turns, qw, qx, qy, qz; the scene's world, SI units.
+        log: of a robot in the scene's world, SI units: CSV with a head (t, x, y, z and, if it turns, qw, qx, qy, qz),
+            MCAP, or a file or folder of LeRobot.
+        log_pose, log_episode: which pose and episode of it, where it has several.
         log_delay_s: of the pictures' clock behind the log's.
         held_px: a box around what it holds of the object, in the same picture.
         held_m: instead, the corners of a box of undeformed material [m], (2, 3), in the scene's world.
@@ -47,18 +48,21 @@ class GripFrom:
     patch: Box | None = None
     colour: tuple[int, int] | None = None
     log: Path | None = None
+    log_pose: str | None = None
+    log_episode: int | None = None
     log_delay_s: float = 0.0
     held_px: Box | None = None
     held_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 
 
-def gripper_path(views: list[View], grip: GripFrom, times: Array) -> RigidPath:
+def gripper_path(views: list[View], grip: GripFrom, times: Array, warnings: list[str]) -> RigidPath:
     """The gripper's motion from what tells it, seen by all cameras.
 
     Args:
         views: the cameras.
         grip: what tells it.
         times: of the frames [s], (T,).
+        warnings: what a log does not say is added.
 
     Raises:
         TrackingFailed: it is not seen, or the log does not cover the recording.
@@ -73,34 +77,13 @@ def gripper_path(views: list[View], grip: GripFrom, times: Array) -> RigidPath:
     if grip.colour is not None:
         return translated(colour_middles(views, grip.colour))
     if grip.log is not None:
-        clock, places, quaternions = _log(grip.log)
-        return logged(clock - grip.log_delay_s, places, quaternions, times)
+        log = read_log(grip.log, grip.log_pose, grip.log_episode)
+        if log.turns is None:
+            warnings.append(
+                f"{grip.log.name} ({log.told}) says no rotation: the gripper is taken not to turn"
+            )
+        return logged(log.times - grip.log_delay_s, log.places, log.turns, times)
     raise TrackingFailed("what tells the gripper's motion? A marker, a patch, a colour or a log")
-
-
-def _log(path: Path) -> tuple[Array, Array, Array | None]:
-    """Times (L,) [s], places (L, 3) [m] and quaternions (L, 4), scalar first, or None, of a robot's log."""
-    if path.stat().st_size > MOST_LOG_BYTES:
-        raise refused(path.name, f"has {path.stat().st_size} bytes, at most {MOST_LOG_BYTES} are read")
-    with path.open(newline="", encoding="utf-8", errors="replace") as stream:
-        reader = csv.reader(stream)
-        head = [name.strip().lower() for name in next(reader, [])]
-        wanted = ["t", "x", "y", "z"]
-        turning = ["qw", "qx", "qy", "qz"]
-        missing = [name for name in wanted if name not in head]
-        if missing:
-            raise refused(path.name, f"has no column {', '.join(missing)}; it has {', '.join(head)[:160]}")
-        columns = [head.index(n) for n in (wanted + turning if set(turning) <= set(head) else wanted)]
-        try:
-            rows = np.array([[float(row[c]) for c in columns] for row in reader if row], dtype=np.float64)
-        except (ValueError, IndexError) as error:
-            raise refused(path.name, f"holds what is no number: {str(error)[:160]}") from error
-    if len(rows) < 2 or not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0).any():
-        raise refused(path.name, f"holds {len(rows)} rows; finite ones in the order of time are needed")
-    turns = rows[:, 4:8] if rows.shape[1] == 8 else None
-    if turns is not None and (np.abs(np.linalg.norm(turns, axis=1) - 1.0) > 1e-2).any():
-        raise refused(path.name, "holds quaternions that are not of length 1")
-    return rows[:, 0], rows[:, 1:4], turns
 
 
 def gripper_controllers(

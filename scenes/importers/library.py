@@ -37,7 +37,14 @@ def parsed(form: str, data: bytes, where: str) -> tuple[dict[str, Array], dict[s
     with tempfile.TemporaryDirectory(prefix="physworld-import-") as folder:
         source = Path(folder) / f"recording.{form}"
         source.write_bytes(data)
-        return _here(form, source, where) if _limited_here else _in_child(form, source, where)
+        return parsed_file(form, source, where)
+
+
+def parsed_file(form: str, source: Path, where: str) -> tuple[dict[str, Array], dict[str, Any]]:
+    """The same of a file on the disk, which is not read into this process."""
+    if (size := source.stat().st_size) > MOST_BYTES:
+        raise _invalid(where, f"has {size} bytes, at most {MOST_BYTES} are read")
+    return _here(form, source, where) if _limited_here else _in_child(form, source.resolve(), where)
 
 
 def _here(form: str, source: Path, where: str) -> tuple[dict[str, Array], dict[str, Any]]:
@@ -50,23 +57,28 @@ def _here(form: str, source: Path, where: str) -> tuple[dict[str, Array], dict[s
 
 
 def _in_child(form: str, source: Path, where: str) -> tuple[dict[str, Array], dict[str, Any]]:
-    target = source.with_suffix(".npz")
-    module = "physworld_scenes.importers.library_child"
-    command = [sys.executable, "-m", module, form, str(source), str(target)]
-    try:
-        child = subprocess.run(
-            command, cwd=Path(__file__).parents[2], capture_output=True, timeout=CHILD_SECONDS, check=False
-        )
-    except subprocess.TimeoutExpired as error:
-        raise _invalid(where, f"reading it took more than {CHILD_SECONDS:.0f} s") from error
-    if child.returncode != 0 or not target.is_file():
-        lines = child.stderr.decode(errors="replace").strip().splitlines()
-        reason = lines[-1][:200] if lines else f"exit status {child.returncode}"
-        raise _invalid(where, f"cannot be read: {reason}")
-    try:
-        return read_arrays(target.read_bytes(), text=True), json.loads(child.stdout)
-    except ArchiveRefused as error:
-        raise _invalid(where, f"cannot be read: {error}") from error
+    with tempfile.TemporaryDirectory(prefix="physworld-import-") as folder:
+        target = Path(folder) / "content.npz"
+        module = "physworld_scenes.importers.library_child"
+        command = [sys.executable, "-m", module, form, str(source), str(target)]
+        try:
+            child = subprocess.run(
+                command,
+                cwd=Path(__file__).parents[2],
+                capture_output=True,
+                timeout=CHILD_SECONDS,
+                check=False,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise _invalid(where, f"reading it took more than {CHILD_SECONDS:.0f} s") from error
+        if child.returncode != 0 or not target.is_file():
+            lines = child.stderr.decode(errors="replace").strip().splitlines()
+            reason = lines[-1][:200] if lines else f"exit status {child.returncode}"
+            raise _invalid(where, f"cannot be read: {reason}")
+        try:
+            return read_arrays(target.read_bytes(), text=True), json.loads(child.stdout)
+        except ArchiveRefused as error:
+            raise _invalid(where, f"cannot be read: {error}") from error
 
 
 def _invalid(where: str, message: str) -> SceneInvalid:

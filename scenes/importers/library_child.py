@@ -1,4 +1,5 @@
-"""Child process of the imports that a library parses: C3D by ezc3d, HDF5 by h5py, MCAP by mcap.
+"""Child process of the imports that a library parses: C3D by ezc3d, HDF5 by h5py, MCAP by mcap, LeRobot's
+episodes by pyarrow.
 
 ``python -m physworld_scenes.importers.library_child FORM SOURCE TARGET`` writes the arrays that it found to TARGET
 (npz) and prints what else there is to say as JSON. Its memory is limited; it ends with status 1 and one line on
@@ -34,6 +35,14 @@ def reader_of(form: str) -> Callable[[str], Content]:
         from physworld_scenes.importers.tables.hdf5_content import content_of as hdf5
 
         return lambda source: (hdf5(source), {})
+    if form == "mcap_poses":
+        from physworld_scenes.importers.robot.mcap_poses import content_of as mcap_poses
+
+        return mcap_poses
+    if form == "lerobot":
+        from physworld_scenes.importers.robot.lerobot_content import content_of as lerobot
+
+        return lerobot
     from physworld_scenes.importers.tables.mcap_content import content_of as mcap
 
     return mcap

@@ -121,7 +121,7 @@ def read_folder(
             warnings.append(f"the folder says no rate: {fps:g} frames per second are assumed")
         times = np.arange(views[0].frames) / fps
         told(0, 1, "gripping")
-        path = None if given.grip is None else gripper_path(views, given.grip, times)
+        path = None if given.grip is None else gripper_path(views, given.grip, times, warnings)
     except TrackingFailed as error:
         raise refused(folder.name, str(error)) from error
     told(0, 1, "scene")

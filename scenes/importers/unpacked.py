@@ -84,6 +84,14 @@ def file_in(top: Path, name: str) -> Path:
     return path
 
 
+def log_in(top: Path, name: str) -> Path:
+    """A robot's log, likewise; it may be the folder of a data set. Raises SceneInvalid."""
+    path = (top / name).resolve()
+    if path.is_relative_to(top.resolve()) and (path / "meta/info.json").is_file():
+        return path
+    return file_in(top, name)
+
+
 def first_pictures(recording: Path) -> tuple[str, list[tuple[str, int, bytes]]]:
     """Which form a recording has, and of each camera name, number of frames (0: not known), and its first picture.
 

@@ -109,8 +109,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--patch", default=None, help="instead, of the gripper: LEFT,TOP,RIGHT,BOTTOM")
     parser.add_argument("--colour", default=None, help="instead, a pixel of its colour: COLUMN,ROW")
     parser.add_argument(
-        "--log", type=Path, default=None, help="instead, the robot's log, CSV: t,x,y,z[,qw,qx,qy,qz]"
+        "--log",
+        type=Path,
+        default=None,
+        help="instead, the robot's log: CSV of t,x,y,z[,qw,qx,qy,qz], MCAP, or LeRobot's parquet or folder",
     )
+    parser.add_argument(
+        "--log-pose",
+        default=None,
+        help="which pose of it: TOPIC, TOPIC:FRAME of tf, or a prefix of LeRobot's names",
+    )
+    parser.add_argument("--log-episode", type=int, default=None, help="which episode of LeRobot")
     parser.add_argument("--log-delay", type=float, default=0.0, help="pictures' clock behind the log's [s]")
     parser.add_argument("--held", default=None, help="box around what it holds: LEFT,TOP,RIGHT,BOTTOM")
     parser.add_argument("--held-m", default=None, help="instead, in the world [m]: X,Y,Z,X,Y,Z")
@@ -280,6 +289,8 @@ def _picture_options(given: argparse.Namespace) -> PictureOptions:
             patch=_box("--patch", given.patch),
             colour=None if colour is None else (int(colour[0]), int(colour[1])),
             log=given.log,
+            log_pose=given.log_pose,
+            log_episode=given.log_episode,
             log_delay_s=given.log_delay,
             held_px=_box("--held", given.held),
             held_m=None if metres is None else ((metres[0], metres[1], metres[2]), (metres[3], metres[4], metres[5])),

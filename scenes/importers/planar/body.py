@@ -64,7 +64,9 @@ def filling(kind: str, placed: Placed, mask: Array, behind: float) -> Array | No
     return layers
 
 
-def gripper_way(placed: Placed, small: View, factor: float, grip: GripFrom, times: Array) -> RigidPath:
+def gripper_way(
+    placed: Placed, small: View, factor: float, grip: GripFrom, times: Array, warnings: list[str]
+) -> RigidPath:
     """The gripper's motion [m]; a log is in the scene's world already.
 
     Args:
@@ -73,10 +75,11 @@ def gripper_way(placed: Placed, small: View, factor: float, grip: GripFrom, time
         factor: see there.
         grip: what tells it, in the picture without distortion.
         times: of the frames [s], (T,).
+        warnings: what a log does not say is added.
     """
     if grip.log is not None:
-        return gripper_path([placed.view], grip, times)
-    way = gripper_path([small], grip, times)
+        return gripper_path([placed.view], grip, times, warnings)
+    way = gripper_path([small], grip, times, warnings)
     return replace(
         way,
         places=way.places / factor,

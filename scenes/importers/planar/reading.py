@@ -95,7 +95,7 @@ def read_planar(
         times, fps = _times(filmed, options, warnings)
         told(0, 1, "gripping")
         gripper = None if given.grip is None else straight_grip(filmed, given.grip)
-        way = None if gripper is None else gripper_way(placed, small, factor, gripper, times)
+        way = None if gripper is None else gripper_way(placed, small, factor, gripper, times, warnings)
     except TrackingFailed as error:
         raise refused(path.name, str(error)) from error
     told(0, 1, "scene")

@@ -56,7 +56,16 @@ def import_recording(
     marker: Annotated[str | None, typer.Option(help="On the gripper: NUMBER[:DICTIONARY], or any.")] = None,
     patch: Annotated[str | None, typer.Option(help="Of the gripper: LEFT,TOP,RIGHT,BOTTOM.")] = None,
     colour: Annotated[str | None, typer.Option(help="A pixel of the gripper's colour: COLUMN,ROW.")] = None,
-    log: Annotated[Path | None, typer.Option(help="The robot's log, CSV: t,x,y,z[,qw,qx,qy,qz].")] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            help="The robot's log: CSV t,x,y,z[,qw,qx,qy,qz], MCAP, or LeRobot's parquet or folder."
+        ),
+    ] = None,
+    log_pose: Annotated[
+        str | None, typer.Option(help="Of it: TOPIC, TOPIC:FRAME of tf, or a prefix of LeRobot's names.")
+    ] = None,
+    log_episode: Annotated[int | None, typer.Option(min=0, help="Of a log of LeRobot.")] = None,
     log_delay: Annotated[float | None, typer.Option(help="Pictures' clock behind the log's [s].")] = None,
     held: Annotated[str | None, typer.Option(help="Box around what is held: LEFT,TOP,RIGHT,BOTTOM.")] = None,
     held_m: Annotated[str | None, typer.Option(help="Instead, in the world [m]: X,Y,Z,X,Y,Z.")] = None,
@@ -117,6 +126,8 @@ def import_recording(
         "--patch": patch,
         "--colour": colour,
         "--log": log,
+        "--log-pose": log_pose,
+        "--log-episode": log_episode,
         "--log-delay": log_delay,
         "--held": held,
         "--held-m": held_m,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,9 +116,24 @@ def _tracking(
             raise typer.BadParameter(f"{path} and {files[name]} have one name")
         return name
 
+    def with_log(path: Path) -> str:
+        """A log of LeRobot comes with what names its components; a data set without its films."""
+        if path.is_dir():
+            inside = [path / "meta/info.json", *sorted(path.glob("data/**/*.parquet"))]
+            name = BESIDE.format(path.resolve().name)
+            files.update({f"{name}/{one.relative_to(path).as_posix()}": one for one in inside})
+            return name
+        if path.suffix.lower() == ".parquet":
+            near = [
+                path.parent / "info.json",
+                *(top / "meta/info.json" for top in list(path.resolve().parents)[:3]),
+            ]
+            files.update({BESIDE.format("info.json"): one for one in near[::-1] if one.is_file()})
+        return beside(path)
+
     facts, _ = _facts(given, several)
     first, _, last = (given["--frames"] or "").partition(":")
-    gripper, plane = _gripper(given, beside), _plane(given, beside)
+    gripper, plane = _gripper(given, beside, with_log), _plane(given, beside)
     told = {
         "boxes": {camera: _pixels("--box", text, 4) for camera, text in map(_of_camera, several["--box"])},
         "masks": {camera: beside(text) for camera, text in map(_of_camera, several["--mask"])},
@@ -136,7 +151,9 @@ def _tracking(
     return facts | {name: value for name, value in told.items() if value not in (None, {}, False)}, files
 
 
-def _gripper(given: Mapping[str, Any], beside: Any) -> dict[str, Any]:
+def _gripper(
+    given: Mapping[str, Any], beside: Callable[[str | Path], str], with_log: Callable[[Path], str]
+) -> dict[str, Any]:
     told: dict[str, Any] = {}
     if given["--marker"] is not None:
         number, _, dictionary = given["--marker"].partition(":")
@@ -146,9 +163,14 @@ def _gripper(given: Mapping[str, Any], beside: Any) -> dict[str, Any]:
         if given[option] is not None:
             told[key] = _pixels(option, given[option], count)
     if given["--log"] is not None:
-        told["log"] = beside(given["--log"])
-    if given["--log-delay"] is not None:
-        told["log_delay_s"] = given["--log-delay"]
+        told["log"] = with_log(given["--log"])
+    for option, key in (
+        ("--log-pose", "log_pose"),
+        ("--log-episode", "log_episode"),
+        ("--log-delay", "log_delay_s"),
+    ):
+        if given[option] is not None:
+            told[key] = given[option]
     if given["--held-m"] is not None:
         corners = _numbers("--held-m", given["--held-m"], 6)
         told["held_m"] = [corners[:3], corners[3:]]
