@@ -61,8 +61,8 @@ class Gripper(Request):
         default=None,
         min_length=1,
         max_length=256,
-        description="Which of several poses: a topic of MCAP, `/tf:FRAME`, or what stands before x, y and z in names of "
-        "LeRobot; null: the only one.",
+        description="Which of several poses: a topic of MCAP, `/tf:FRAME`, or what stands before x, y and z in "
+        "names of LeRobot; null: the only one.",
         examples=["/tool/pose"],
     )
     log_episode: int | None = Field(

@@ -11,7 +11,9 @@ import zipfile
 from pathlib import Path
 
 import marker_files
+import numpy as np
 import pytest
+import robot_logs
 import tracking_pictured
 from dashboard_browser import Visit
 from dashboard_world import World, add_scene, chain_recording
@@ -241,6 +243,9 @@ def test_pictures_are_looked_at_a_box_is_drawn_and_a_job_follows_the_object(
         for path in sorted(folder.rglob("*.*")):
             packed.write(path, path.relative_to(tmp_path).as_posix())
     (tmp_path / "robot.csv").write_text("t,x,y,z\n0,0,0,0\n1,0,0,0.1\n")
+    arm = tmp_path / "arm"
+    robot_logs.lerobot_info(arm, list(robot_logs.EULER))
+    robot_logs.lerobot_file(arm / "episode_000004.parquet", {4: (np.arange(2.0), np.zeros((2, 7)))})
     visit.open("/scenes")
     visit.page.get_by_role("link", name="Make a scene of them").click()
     visit.page.set_input_files("#pictures", archive)
@@ -294,7 +299,8 @@ def test_pictures_are_looked_at_a_box_is_drawn_and_a_job_follows_the_object(
     for corner, value in zip(("Left", "Top", "Right", "Bottom"), (42, 32, 118, 88), strict=True):
         visit.page.get_by_role("group", name="Box of the object").get_by_label(corner).fill(str(value))
     visit.page.get_by_label("What moves the object").select_option("log")
-    visit.page.set_input_files("[data-log]", tmp_path / "robot.csv")
+    visit.page.set_input_files("[data-log]", [arm / "meta/info.json", arm / "episode_000004.parquet"])
+    visit.page.get_by_label("Episode in the log").fill("4")
     visit.page.get_by_role("button", name="Make the scene").click()
     visit.page.wait_for_url(re.compile(r"/jobs/job_"))
     with world.database.session() as session:
@@ -303,8 +309,17 @@ def test_pictures_are_looked_at_a_box_is_drawn_and_a_job_follows_the_object(
         jobs.cancel_job(session, job.id)
     data = world.stores.artifacts.read_bytes(job.inputs[0].digest or "")
     with zipfile.ZipFile(io.BytesIO(data)) as sent:
-        assert {"robot.csv", "color/0.png", "depth/11.png", "camera_intrinsic.json"} <= set(sent.namelist())
-    assert job.config["gripper"] == {"log": "robot.csv"} and shard.kind == "tracking"
+        assert {
+            "episode_000004.parquet",
+            "info.json",
+            "color/0.png",
+            "depth/11.png",
+            "camera_intrinsic.json",
+        } <= set(sent.namelist())
+    assert (
+        job.config["gripper"] == {"log": "episode_000004.parquet", "log_episode": 4}
+        and shard.kind == "tracking"
+    )
     visit.open("/trackings")
     visit.page.set_input_files("#pictures", tmp_path / "robot.csv")
     visit.page.get_by_role("button", name="Look").click()

@@ -8,13 +8,17 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
+import robot_logs
 from physworld_client import Client
 from physworld_client.errors import JobFailed
+from scipy.spatial.transform import Rotation
 from service_process import ServiceProcess, until
 from tracking_pictured import BOTTOM, FRAMES, LEFT, RIGHT, TOP, write
 
+from physworld_scenes.bundle import bundle_from_bytes
 from physworld_schemas.tracking import Gripper, TrackingOptions
 
 WITHIN_S = 180.0
@@ -31,8 +35,13 @@ def working(service: ServiceProcess) -> list[psutil.Process]:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_pictures_become_scenes_by_sdk_and_command_line(tmp_path: Path) -> None:
-    folder = tmp_path / "plate"
+    folder, arm = tmp_path / "plate", tmp_path / "arm"
     write(folder)
+    times = np.arange(FRAMES + 1) / 30.0
+    robot_logs.lerobot_info(arm, list(robot_logs.EULER))
+    robot_logs.lerobot_file(arm / "data/chunk-000/file-000.parquet", {
+        0: (times, np.zeros((len(times), 7))), 1: (times, robot_logs.states_of(times)),
+    })  # fmt: skip
     with ServiceProcess(tmp_path / "data", "--workers", "0", "--no-trainer") as service:
         service.start()
         state = service.state()
@@ -55,7 +64,7 @@ def test_pictures_become_scenes_by_sdk_and_command_line(tmp_path: Path) -> None:
             environment = {**os.environ, "PHYSWORLD_URL": state["api_url"], "PHYSWORLD_TOKEN": key}
             words = [
                 "import", str(folder), "--service", "--kind", "sheet", "--rate", "30", "--up", "-y", "--mass", "0.07",
-                "--box", ",".join(map(str, BOX)), "--patch", ",".join(map(str, PATCH)), "--points", "40",
+                "--box", ",".join(map(str, BOX)), "--log", str(arm), "--log-episode", "1", "--points", "40",
                 "--held", ",".join(map(str, HELD)), "--picture", str(tmp_path / "look.png"), "--keep-pictures",
             ]  # fmt: skip
             command = [str(Path(sys.executable).parent / "physworld"), *words]
@@ -65,6 +74,14 @@ def test_pictures_become_scenes_by_sdk_and_command_line(tmp_path: Path) -> None:
             kept = client.scenes.get(made.id)
             assert kept.declared is not None and kept.declared["body"]["mass_kg"] == 0.07
             assert {"camera.json", "frames.npz"} <= {item.name for item in kept.artifacts}
+            archive = next(item for item in kept.artifacts if item.name == "scene.zip")
+            there = client.artifacts.download(archive, tmp_path / "kept.zip")
+            held = bundle_from_bytes(there.read_bytes())[0].controllers
+            places, turns = robot_logs.path_of(times[:FRAMES])
+            rotation = Rotation.from_quat(turns[:, [1, 2, 3, 0]])
+            inside = rotation[0].inv().apply(held[0] - places[0])
+            wanted = np.stack([turn.apply(inside) + at for turn, at in zip(rotation, places, strict=True)])
+            assert np.abs(held - wanted).max() < 1e-5  # the log is in float32
             assert (tmp_path / "look.png").read_bytes().startswith(b"\x89PNG")
 
             with pytest.raises(JobFailed) as caught:

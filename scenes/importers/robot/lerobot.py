@@ -1,10 +1,10 @@
 """The end effector's poses in an episode of a LeRobot data set, formats v2 and v3.
 
 ``meta/info.json`` names the components of ``observation.state``: a list, or a dictionary of one. Its place is three
-names that end in x, y and z; its rotation roll, pitch, yaw [rad, about the fixed axes x, y, z in this order]; wx, wy, wz or
-axis_angle, a rotation vector [rad], as LeRobot's own kinematics write it; or a quaternion qw, qx, qy, qz or rx, ry, rz,
-rw. What stands before them, without words such as ``pos``, tells several arms apart. Joint states give no pose: no
-kinematics of a robot are computed here.
+names that end in x, y and z. Its rotation is roll, pitch, yaw [rad] about the fixed axes x, y, z in this order; or wx,
+wy, wz or axis_angle, a rotation vector [rad], as LeRobot's own kinematics write it; or a quaternion qw, qx, qy, qz or
+rx, ry, rz, rw. What stands before them, without words such as ``pos``, tells several arms apart. Joint states give no
+pose: no kinematics of a robot are computed here.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -23,7 +24,9 @@ from typing import IO, Any
 import cv2
 import numpy as np
 import pytest
+import robot_logs
 from planar_filmed import BOARD, Film
+from scipy.spatial.transform import Rotation
 from tracking_pictured import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, write
 
 from physworld.camera import MOST_PIXELS
@@ -320,6 +323,22 @@ OPTIONS_OF_NOBODY: dict[str, tuple[dict[str, Any], str]] = {
     "a mask that claims 100,000 a side": ({"masks": {"0": "claims.png"}}, "claims.png: is no mask"),
     "tracks that are pictures": ({"tracks": {"0": "color/0.png"}}, "0.png"),
     "a log that is a picture": ({"gripper": {"log": "color/0.png", "held_px": [60, 50, 70, 60]}}, "0.png"),
+    "a log that is cut short": (
+        {"gripper": {"log": "cut.mcap", "held_px": [60, 50, 70, 60]}},
+        "cut.mcap: cannot be read",
+    ),
+    "a log of joints": (
+        {"gripper": {"log": "set/joints.parquet", "held_px": [60, 50, 70, 60]}},
+        "no x, y and z of an end effector",
+    ),
+    "a log outside": (
+        {"gripper": {"log": "../../request.json", "held_px": [60, 50, 70, 60]}},
+        "is no file of the archive",
+    ),
+    "an episode of pictures": (
+        {"gripper": {"log": "color/0.png", "log_episode": 3, "held_px": [60, 50, 70, 60]}},
+        "0.png: is no data set of LeRobot: it has no episode 3",
+    ),
     "a log of nothing": ({"gripper": {"log": "empty.csv", "held_px": [60, 50, 70, 60]}}, "empty.csv"),
     "a plane beside depth": ({"plane": {"board": "charuco:7x5:0.04:0.03"}}, "is of a film"),
     "gravity of nobody": ({"gravity_m_s2": [1e300, 0, 0]}, ""),
@@ -327,10 +346,40 @@ OPTIONS_OF_NOBODY: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+def robot_files() -> Files:
+    """Logs of a robot: MCAP whole and cut, and a data set of joints."""
+    times = np.arange(20) / 30.0
+    whole = robot_logs.mcap_pose(times, *robot_logs.path_of(times))
+    with tempfile.TemporaryDirectory() as folder:
+        robot_logs.lerobot_info(Path(folder), ["shoulder.pos", "elbow.pos"])
+        robot_logs.lerobot_file(Path(folder) / "joints.parquet", {0: (times, np.zeros((20, 2)))})
+        held = {
+            f"set/{name}": (Path(folder) / name).read_bytes() for name in ("joints.parquet", "meta/info.json")
+        }
+    return {"tool.mcap": whole, "cut.mcap": whole[: len(whole) // 2], **held}
+
+
+def test_a_log_in_an_archive_moves_the_gripper(child: Child, sound: Files) -> None:
+    grip = {"log": "tool.mcap", "log_pose": "/tool/pose", "held_px": [60, 50, 70, 60]}
+    said, folder = child.follow(packed(sound | robot_files()), OPTIONS | {"gripper": grip})
+    assert said == ""
+    scene = bundle_from_bytes((folder / ARCHIVE).read_bytes())[0]
+    places, turns = robot_logs.path_of(np.arange(FRAMES) / 30.0)
+    rotation = Rotation.from_quat(turns[:, [1, 2, 3, 0]])
+    held = rotation[0].inv().apply(scene.controllers[0] - places[0])
+    wanted = np.stack([turn.apply(held) + place for turn, place in zip(rotation, places, strict=True)])
+    assert np.abs(scene.controllers - wanted).max() < 1e-6
+
+
 @pytest.mark.parametrize("what", list(OPTIONS_OF_NOBODY))
 def test_options_that_do_not_fit_the_pictures_are_refused(child: Child, sound: Files, what: str) -> None:
     options, words = OPTIONS_OF_NOBODY[what]
-    beside = {"large.png": encoded(LARGE), "claims.png": png(100_000, 100_000), "empty.csv": b""}
+    beside = {
+        "large.png": encoded(LARGE),
+        "claims.png": png(100_000, 100_000),
+        "empty.csv": b"",
+        **robot_files(),
+    }
     said, _ = child.follow(packed(sound | beside), OPTIONS | options)
     assert words in said and (said or not words), said
 

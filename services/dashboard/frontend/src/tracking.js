@@ -33,14 +33,20 @@ async function packed(name, files) {
   return new File([await zipped(tree)], `${name}.zip`, { type: "application/zip" });
 }
 
+/** A robot's log and what came with it: of LeRobot, the info.json that names its components. */
+function logFiles() {
+  const files = [...form.querySelector("[data-log]").files];
+  return [files.find((one) => !/\.json$/i.test(one.name)), files];
+}
+
 /** The file with a robot's log beside what it holds. */
-async function withLog(file, log) {
+async function withLog(file, logs) {
   const tree = FILM.test(file.name) ? { [file.name]: await bytesOf(file) } : null;
   if (!tree && !ZIPPED.test(file.name)) throw new Error(`A log goes into a folder, a zip or beside a film, not into ${file.name}.`);
   const held = tree ?? (await unzipped(await bytesOf(file)));
   const top = Object.keys(held).find((path) => /(^|\/)(color|colour|rgb|image)\//.test(path)) ?? "";
   const folder = top.replace(/(color|colour|rgb|image)\/.*$/, "");
-  held[`${folder}${log.name}`] = await bytesOf(log);
+  for (const log of logs) held[`${folder}${log.name}`] = await bytesOf(log);
   return new File([await zipped(held)], `${file.name.replace(/\.[^.]+$/, "")}.zip`, { type: "application/zip" });
 }
 
@@ -139,12 +145,17 @@ function optionsOf() {
   }
   if (Object.keys(body).length) options.body = body;
   const said = form.querySelector("[data-gripper]").value;
-  const log = form.querySelector("[data-log]").files[0];
   if (said !== "none") {
     options.gripper = {};
     if (said === "patch") options.gripper.patch = boxes.patch[0] ?? null;
     if (said === "marker") options.gripper.marker = form.querySelector("[data-marker]").valueAsNumber || 0;
-    if (said === "log") options.gripper.log = log ? log.name : null;
+    if (said === "log") {
+      const pose = form.querySelector("[data-log-pose]").value.trim();
+      const episode = form.querySelector("[data-log-episode]").valueAsNumber;
+      options.gripper.log = logFiles()[0]?.name ?? null;
+      if (pose) options.gripper.log_pose = pose;
+      if (!Number.isNaN(episode)) options.gripper.log_episode = episode;
+    }
     if (boxes.held[0]) options.gripper.held_px = boxes.held[0];
   }
   if (!form.querySelector("[data-film]").hidden) {
@@ -157,10 +168,9 @@ function optionsOf() {
 }
 
 async function start() {
-  const log = form.querySelector("[data-log]").files[0];
   try {
     const options = optionsOf();
-    const file = options.gripper?.log ? await withLog(chosen, log) : chosen;
+    const file = options.gripper?.log ? await withLog(chosen, logFiles()[1]) : chosen;
     post(form, file, options, "Storing the pictures …");
   } catch (error) {
     tell(form, error.message);
