@@ -207,8 +207,8 @@ def _rows(path: Path, episode: int | None) -> tuple[Array, Array, int]:
         arrays, _ = parsed_file("lerobot", file, file.name)
         state, times = arrays["state"], arrays["times"]
         numbers = arrays.get("episodes", np.zeros(len(times), dtype=np.int64))
-        if episode in numbers:
-            return state[numbers == episode], times[numbers == episode], int(episode)
+        if episode is not None and episode in numbers:
+            return state[numbers == episode], times[numbers == episode], episode
         held |= {int(number): (state, times) for number in np.unique(numbers)}
         if episode is None and len(held) > 1:
             raise refused(path.name, f"has several episodes, {_range(held)} among them: say which")
