@@ -228,6 +228,30 @@ class FirstPicture(Resource):
     data: str = Field(default="", description="The picture, base64.", examples=["iVBORw0KGgo="])
 
 
+class FirstCloud(Resource):
+    """What pictures with depth show first: every n-th pixel that has depth, in the world of the scene to be."""
+
+    places_m: list[tuple[float, float, float]] = Field(
+        description="At most 5000 places, z up.", json_schema_extra=METRES, examples=[[[0.012, 0.48, 0.11]]]
+    )
+    colours: list[tuple[int, int, int]] = Field(
+        description="Of each: red, green, blue, of 255.", examples=[[[130, 91, 52]]]
+    )
+    cameras: list[int] = Field(description="Number of the camera that saw each.", examples=[[0]])
+    pixels: list[tuple[int, int]] = Field(
+        description="Column and row of each in the first picture of its camera.",
+        json_schema_extra=PX,
+        examples=[[[64, 48]]],
+    )
+    ground_m: float | None = Field(
+        description="Height of the ground; null: none is seen.", json_schema_extra=METRES, examples=[0.0]
+    )
+    up: str = Field(
+        description="How up was found.", examples=["the normal of the ground in the first picture"]
+    )
+    warnings: list[str] = Field(description="What was guessed.", examples=[["no ground is seen"]])
+
+
 class TrackingPreview(Resource):
     """What an archive of pictures or a film holds; nothing is stored."""
 
@@ -235,3 +259,11 @@ class TrackingPreview(Resource):
         description="Pictures with depth, or a film of a motion in a plane.", examples=["rgbd"]
     )
     cameras: list[FirstPicture] = Field(description="The first picture of each camera.")
+    cloud: FirstCloud | None = Field(
+        default=None, description="Of pictures with depth; null: there is none, or `unclouded` says why not."
+    )
+    unclouded: str | None = Field(
+        default=None,
+        description="What keeps the depth of the first pictures from being shown.",
+        examples=["cameras: holds no calibration"],
+    )

@@ -18,9 +18,9 @@ import tempfile
 from pathlib import Path
 
 from physworld.scene import Scene
-from physworld.tracking.mask import Box
 from physworld.tracking.places import TrackConfig
 from physworld.tracking.recording import Followed
+from physworld.tracking.view import Box
 from physworld_scenes.bundle import write_archive
 from physworld_scenes.errors import SceneInvalid, refused
 from physworld_scenes.facts import facts_of

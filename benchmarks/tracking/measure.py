@@ -21,7 +21,7 @@ from benchmarks.tracking.plays import MARKER_ID
 from physworld.arrays import Array
 from physworld.geometry.rigid import least_rotation
 from physworld.scene import Scene
-from physworld.tracking.mask import Box
+from physworld.tracking.view import Box
 from physworld_scenes.importers.gripping import GripFrom
 from physworld_scenes.importers.options import ImportOptions
 from physworld_scenes.importers.rgbd import PictureOptions, read_folder

@@ -17,9 +17,8 @@ import numpy as np
 from benchmarks.tracking.plays import marker_picture
 from benchmarks.tracking.raycast import Stage, Surface
 from physworld.arrays import Array
-from physworld.tracking.mask import Box
 from physworld.tracking.recording import masks_of
-from physworld.tracking.view import View
+from physworld.tracking.view import Box, View
 from physworld.video import GaussianCarrier, Renderer, SplatConfig, SplatView, compare_frames, fit_splat
 from physworld_scenes.importers.pictures import read_pictures
 

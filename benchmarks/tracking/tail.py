@@ -26,9 +26,9 @@ from skimage.morphology import skeletonize
 
 from physworld.arrays import Array
 from physworld.scene import Scene
-from physworld.tracking.mask import Box
 from physworld.tracking.plane import stretch
 from physworld.tracking.recording import Followed
+from physworld.tracking.view import Box
 from physworld_scenes.importers.gripping import GripFrom
 from physworld_scenes.importers.options import ImportOptions
 from physworld_scenes.importers.planar.place import PlaneFrom

@@ -19,7 +19,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.camera import Camera
 from physworld.errors import TrackingFailed
-from physworld.tracking.view import back_project, cloud_of
+from physworld.tracking.view import Box, back_project, cloud_of
 
 BEFORE_SHARE, BEHIND_SHARE = 0.4, 0.8
 """How far before and behind its nearest large part the object may reach, in diagonals of the box."""
@@ -35,30 +35,6 @@ LEAST_BY_COLOUR = 0.5
 GROUND_CLEARANCE_M = 0.006
 ROUNDS = 6
 LEAST_PIXELS = 60
-
-
-@dataclass(frozen=True)
-class Box:
-    """A rectangle of pixels: left, top, right, bottom; the last two are outside of it."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    def within(self, width: int, height: int) -> Box:
-        """The part of it that is in the picture.
-
-        Raises:
-            TrackingFailed: nothing is.
-        """
-        inside = Box(max(self.left, 0), max(self.top, 0), min(self.right, width), min(self.bottom, height))
-        if inside.right - inside.left < 4 or inside.bottom - inside.top < 4:
-            raise TrackingFailed(
-                f"the box {self.left},{self.top},{self.right},{self.bottom} has nothing of the "
-                f"picture of {width} x {height} px"
-            )
-        return inside
 
 
 def mask_in_box(

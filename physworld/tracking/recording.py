@@ -17,11 +17,11 @@ from physworld.errors import TrackingFailed
 from physworld.tracking.agreement import Agreement, agreement
 from physworld.tracking.depth import without_strays
 from physworld.tracking.given import GivenFollower, GivenTracks
-from physworld.tracking.mask import Box, Outline, mask_in_box, mask_near_cloud
+from physworld.tracking.mask import Outline, mask_in_box, mask_near_cloud
 from physworld.tracking.neighbours import carried
 from physworld.tracking.places import FirstPlaces, TrackConfig
 from physworld.tracking.points import Follower, follow
-from physworld.tracking.view import View, back_project, cloud_of
+from physworld.tracking.view import Box, View, back_project, cloud_of
 
 CLOUD_CELL_M = 2.5e-3
 MOST_OF_CLOUD, EDGE_PATCH_PX = 6000, 8

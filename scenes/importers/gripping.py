@@ -12,11 +12,10 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
 from physworld.tracking.grips import colour_middles, logged, translated
-from physworld.tracking.mask import Box
 from physworld.tracking.poses import marker_path
 from physworld.tracking.recording import Followed, patch_points
 from physworld.tracking.rigid import RigidPath, rigid_path
-from physworld.tracking.view import View, cloud_of
+from physworld.tracking.view import Box, View, cloud_of
 from physworld_scenes.errors import refused
 from physworld_scenes.importers.robot.log import read_log
 

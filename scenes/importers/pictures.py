@@ -79,18 +79,7 @@ def read_pictures(folder: Path, depth_scale: float | None = None, frames: slice 
     Raises:
         SceneInvalid: with what is missing, damaged or too large.
     """
-    colour_root, depth_root = _part(folder, COLOUR_FOLDERS), _part(folder, DEPTH_FOLDERS)
-    if colour_root is None or depth_root is None:
-        raise refused(folder.name, "holds no folder color beside a folder depth")
-    colours, depths = cameras_in(colour_root), cameras_in(depth_root)
-    if len(colours) != len(depths) or (len(colours) > 1 and list(colours) != list(depths)):
-        raise refused(
-            "depth",
-            f"{len(depths)} cameras have depth ({', '.join(depths)}), "
-            f"{len(colours)} have colours ({', '.join(colours)})",
-        )
-    names = list(colours)
-    calibration = calibration_of(folder, names)
+    colours, depths, calibration = _parts(folder)
     films = [_film(files[0]) if files[0].suffix.lower() in FILMS else None for files in colours.values()]
     counts = [
         len(files) if film is None else len(film) for film, files in zip(films, colours.values(), strict=True)
@@ -109,9 +98,50 @@ def read_pictures(folder: Path, depth_scale: float | None = None, frames: slice 
             zip(films, colours.values(), depths.values(), strict=True)
         )
     ]
-    return Pictures(
-        views, names, kept, counts[0], calibration.fps, calibration.poses is not None, calibration.layout
-    )
+    placed = calibration.poses is not None
+    return Pictures(views, list(colours), kept, counts[0], calibration.fps, placed, calibration.layout)
+
+
+def read_first(folder: Path, depth_scale: float | None = None, most_pixels: int = MOST_PIXELS) -> Pictures:
+    """The first frame alone, without a look at the others.
+
+    Args:
+        folder: one of the layouts.
+        depth_scale: depth values a metre; None: 1000 of whole numbers, 1 of others.
+        most_pixels: of all cameras' pictures.
+
+    Raises:
+        SceneInvalid: with what is missing, damaged or too large.
+    """
+    colours, depths, calibration = _parts(folder)
+    views: list[View] = []
+    pixels = 0
+    for number, (files, depth) in enumerate(zip(colours.values(), depths.values(), strict=True)):
+        film = _film(files[0], 1) if files[0].suffix.lower() in FILMS else None
+        width, height = size_of(files[0]) if film is None else film[0].shape[1::-1]
+        pixels += width * height
+        if pixels > most_pixels:
+            raise refused(
+                "color", f"has {pixels} pixels in {number + 1} cameras, at most {most_pixels} are shown"
+            )
+        views.append(_view(number, (film, files, depth), calibration, depth_scale, [0]))
+    placed = calibration.poses is not None
+    return Pictures(views, list(colours), [0], 1, calibration.fps, placed, calibration.layout)
+
+
+def _parts(folder: Path) -> tuple[dict[str, list[Path]], dict[str, list[Path]], Calibration]:
+    """Files of colour and of depth by camera, and how the cameras are calibrated."""
+    colour_root, depth_root = _part(folder, COLOUR_FOLDERS), _part(folder, DEPTH_FOLDERS)
+    if colour_root is None or depth_root is None:
+        raise refused(folder.name, "holds no folder color beside a folder depth")
+    colours, depths = cameras_in(colour_root), cameras_in(depth_root)
+    if len(colours) != len(depths) or (len(colours) > 1 and list(colours) != list(depths)):
+        raise refused(
+            "depth",
+            f"{len(depths)} cameras have depth ({', '.join(depths)}), "
+            f"{len(colours)} have colours ({', '.join(colours)})",
+        )
+    return colours, depths, calibration_of(folder, list(colours))
 
 
 def _view(
@@ -250,8 +280,8 @@ def _depth(path: Path, shape: tuple[int, int], scale: float | None) -> Array:
     return metres
 
 
-def _film(path: Path) -> list[Array]:
-    """All frames of a film, within the limit."""
+def _film(path: Path, most: int | None = None) -> list[Array]:
+    """All frames of a film, or the first ones, within the limit."""
     import av
 
     frames: list[Array] = []
@@ -262,6 +292,8 @@ def _film(path: Path) -> list[Array]:
             if stream.width * stream.height > MOST_PIXELS:
                 raise refused(path.name, f"has {stream.width} x {stream.height} pixels")
             for frame in container.decode(stream):
+                if len(frames) == most:
+                    break
                 frames.append(frame.to_ndarray(format="rgb24"))
                 total += frames[-1].nbytes
                 if total > MOST_FILM_BYTES:

@@ -20,27 +20,25 @@ from physworld.camera import Camera
 from physworld.errors import TrackingFailed
 from physworld.scene import Scene, sigma_of
 from physworld.tracking.agreement import WARNED_APART_M
-from physworld.tracking.ground import Plane, ground_plane, world_over
-from physworld.tracking.mask import Box
+from physworld.tracking.ground import Plane
 from physworld.tracking.middle import onto_middle
 from physworld.tracking.noise import sighting_covariances
 from physworld.tracking.places import TrackConfig
 from physworld.tracking.recording import Followed, Masks, edged_cloud, follow_all, masks_of
 from physworld.tracking.rigid import RigidPath
-from physworld.tracking.view import View, cloud_of
+from physworld.tracking.view import Box
 from physworld_scenes.bundle import checked, scene_from_parts
 from physworld_scenes.errors import refused
-from physworld_scenes.importers.axes import ROTATION_FROM_UP, axis_along
 from physworld_scenes.importers.given_tracks import read_tracks
 from physworld_scenes.importers.gripping import GripFrom, gripper_controllers, gripper_path
 from physworld_scenes.importers.options import ImportOptions, estimate_noise, split_of
 from physworld_scenes.importers.pictures import Pictures, read_pictures
+from physworld_scenes.importers.upright import upright
 
 DEFAULT_KIND, DEFAULT_FPS = "blob", 30.0
 ROD_KINDS, SHEET_KINDS = ("rope", "rod", "branched_rope"), ("sheet", "cloth")
 GROUND_NEAR_M = 0.05
 """From the object's lowest point: a ground that is farther away is none of the scene."""
-LEVEL_DEG = 15.0
 UNSEEN_WARNING = 0.1
 
 STAGES = ("reading", "tracking", "cloud", "gripping", "scene")
@@ -105,7 +103,7 @@ def read_folder(
             )
     tracks = read_tracks(folder, given.tracks, recording, warnings)
     try:
-        recording, ground, up = _upright(recording, given, warnings)
+        recording, ground, up = upright(recording, given.up, given.boxes, warnings)
         views = recording.views
         boxes = [given.boxes.get(number) for number in range(len(views))]
         made = [mask_file(given.masks.get(number), view.camera) for number, view in enumerate(views)]
@@ -183,62 +181,6 @@ def _cameras(masks: Masks, followed: Followed) -> dict[str, Any]:
         "clouds_apart_m": {f"{a.other} and {a.camera}": a.apart_m for a in masks.agreements},
         "left_out": {str(number): reason for number, reason in followed.left_out.items()},
     }
-
-
-def _upright(
-    recording: Pictures, given: PictureOptions, warnings: list[str]
-) -> tuple[Pictures, Plane | None, str]:
-    """The recording in a world with z up, its ground, and how up was found."""
-    if given.up is not None and given.up not in ROTATION_FROM_UP:
-        raise refused("up", f"{given.up!r}; known: {', '.join(ROTATION_FROM_UP)}")
-    outside = [_outside(view, given.boxes.get(number)) for number, view in enumerate(recording.views)]
-    if not recording.placed and given.up is None:
-        plane = ground_plane(outside[0], np.array([0.0, -1.0, 0.0]), np.zeros(3))
-        if plane is not None:
-            views = [_in_world(view, world_over(plane, view.camera)) for view in recording.views]
-            found = Plane(np.array([0.0, 0.0, 1.0]), 0.0, plane.share, plane.spread_m)
-            return replace(recording, views=views), found, "the normal of the ground in the first picture"
-        warnings.append("no ground is seen: up is taken to be up in the picture; --up names another axis")
-    axis, how = given.up, "given"
-    if axis is None:
-        # a camera's picture is upright, or it looks down
-        ups = [
-            -(v.camera.world_to_camera[1, :3] + 0.7 * v.camera.world_to_camera[2, :3])
-            for v in recording.views
-        ]
-        axis = axis_along(np.mean(ups, axis=0)) if recording.placed else "-y"
-        how = "guessed from how the cameras stand"
-        if axis != "z":
-            warnings.append(
-                f"up is guessed to be {axis} of the cameras' world, which is turned; --up names another"
-            )
-    turn = np.eye(4)
-    turn[:3, :3] = ROTATION_FROM_UP[axis].T
-    views = [_in_world(view, view.camera.world_to_camera @ turn) for view in recording.views]
-    points = np.concatenate(outside) @ ROTATION_FROM_UP[axis].T
-    eyes = [np.tile(view.camera.centre, (len(own), 1)) for view, own in zip(views, outside, strict=True)]
-    plane = ground_plane(points, np.array([0.0, 0.0, 1.0]), np.concatenate(eyes))
-    if plane is not None:
-        off = float(np.degrees(np.arccos(np.clip(plane.normal[2], -1, 1))))
-        if off > LEVEL_DEG:
-            plane = None
-        elif off > 2.0:
-            warnings.append(f"the ground is tilted by {off:.1f} degrees against z of the cameras' world")
-    return replace(recording, views=views), plane, f"{axis} of the cameras' world, {how}"
-
-
-def _outside(view: View, box: Box | None) -> Array:
-    """Places (P, 3) [m] of the first picture outside of the object's box, every third pixel."""
-    depth = view.depth(0)
-    mask = np.zeros(depth.shape, dtype=bool)
-    mask[::3, ::3] = True
-    if box is not None:
-        mask[max(box.top, 0) : max(box.bottom, 0), max(box.left, 0) : max(box.right, 0)] = False
-    return cloud_of(view.camera, depth, mask)[0]
-
-
-def _in_world(view: View, world_to_camera: Array) -> View:
-    return replace(view, camera=replace(view.camera, world_to_camera=world_to_camera))
 
 
 def mask_file(path: Path | None, camera: Camera) -> Array | None:

@@ -27,10 +27,12 @@ from typing import Any
 import scipy.spatial  # noqa: F401  so that a child need not
 import trimesh  # noqa: F401
 
+from physworld.tracking.view import Box
 from physworld_scenes.bundle import checked, write_archive
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.facts import facts_of
 from physworld_scenes.importers import ImportOptions, import_any, look_at
+from physworld_scenes.importers.first_cloud import first_cloud
 from physworld_scenes.importers.library import limit_here
 from physworld_scenes.importers.unpacked import first_pictures, media_type_of, unpacked
 from physworld_scenes.limited import (
@@ -95,7 +97,9 @@ def _read(request: dict[str, Any]) -> int:
         limits_of((folder / UPLOAD).stat().st_size).impose()
         tempfile.tempdir = str(folder)  # what a killed child leaves goes with the upload
         if request.get("pictures"):
-            (folder / FOUND).write_text(json.dumps(_pictured(folder, request["filename"])))
+            (folder / FOUND).write_text(
+                json.dumps(_pictured(folder, request["filename"], request["options"]))
+            )
             return 0
         data = (folder / UPLOAD).read_bytes()
         options = ImportOptions(**request["options"])
@@ -129,18 +133,49 @@ def _looked(data: bytes, filename: str, options: ImportOptions) -> dict[str, Any
     }
 
 
-def _pictured(folder: Path, filename: str) -> dict[str, Any]:
-    """What each camera of an archive of pictures shows first, as far as it is small enough to be shown."""
+def _pictured(folder: Path, filename: str, options: dict[str, Any]) -> dict[str, Any]:
+    """What each camera of an archive of pictures shows first, as far as it is small enough to be shown, and its cloud.
+
+    Args:
+        folder: in which it lies.
+        filename: what its sender calls it.
+        options: ``up``, ``boxes`` and ``depth_scale``.
+    """
     place, shown, left = folder / "pictures", [], SHOWN_BYTES
     place.mkdir()
-    form, cameras = first_pictures(unpacked(folder / UPLOAD, filename, place))
+    recording = unpacked(folder / UPLOAD, filename, place)
+    form, cameras = first_pictures(recording)
     for number, (name, frames, picture) in enumerate(cameras):
         camera: dict[str, Any] = {"camera": number, "name": name, "frames": frames}
         if picture and len(picture) <= left:
             left -= len(picture)
             camera |= {"media_type": media_type_of(picture), "data": base64.b64encode(picture).decode()}
         shown.append(camera)
-    return {"form": form, "cameras": shown}
+    cloud = _clouded(recording, options) if form == "rgbd" else {}
+    return {"form": form, "cameras": shown, **cloud}
+
+
+def _clouded(recording: Path, options: dict[str, Any]) -> dict[str, Any]:
+    """The cloud of the first frame, or why there is none: who only wants to draw a box is not refused."""
+    try:
+        boxes = {int(camera): Box(*corners) for camera, corners in options["boxes"].items()}
+        found = first_cloud(recording, options["up"], boxes, options["depth_scale"])
+    except SceneInvalid as error:
+        return {"unclouded": str(error)[:FAULT_CHARACTERS]}
+    except ImportError as error:
+        return {"unclouded": f"{error.name} is not installed here, which reads it"}
+    except MemoryError:
+        return {"unclouded": "it takes more memory than a look may"}
+    cloud = {
+        "places_m": found.places.round(5).tolist(),
+        "colours": found.colours.tolist(),
+        "cameras": found.cameras.tolist(),
+        "pixels": found.pixels.tolist(),
+        "ground_m": found.ground,
+        "up": found.up,
+        "warnings": found.warnings,
+    }
+    return {"cloud": cloud}
 
 
 def _refuse(folder: Path, faults: list[FieldError]) -> int:

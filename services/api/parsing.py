@@ -79,13 +79,22 @@ class Parsers:
             {"folder": str(folder), "filename": filename, "name": None, "options": options, "look": True},
         )
 
-    def pictures(self, folder: Path, filename: str) -> dict[str, Any]:
+    def pictures(self, folder: Path, filename: str, options: dict[str, Any]) -> dict[str, Any]:
         """What the archive or film ``upload`` in ``folder`` shows first: a ``TrackingPreview``'s fields.
+
+        Args:
+            filename: what the sender calls it.
+            options: ``up``, ``boxes`` and ``depth_scale`` of a ``TrackingOptions``.
 
         Raises:
             SceneInvalid, ApiProblem: as of ``parse``.
         """
-        request: dict[str, Any] = {"folder": str(folder), "filename": filename, "name": None, "options": {}}
+        request: dict[str, Any] = {
+            "folder": str(folder),
+            "filename": filename,
+            "name": None,
+            "options": options,
+        }
         return self._asked(folder, request | {"pictures": True})
 
     def _asked(self, folder: Path, request: dict[str, Any]) -> dict[str, Any]:

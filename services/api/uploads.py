@@ -144,7 +144,10 @@ def pictured(upload: Upload[TrackingOptions], parsers: Parsers) -> TrackingPrevi
     """What an archive of pictures holds, found in another process. Raises SceneInvalid."""
     with tempfile.TemporaryDirectory(prefix="physworld-upload-") as folder:
         _copied(upload, Path(folder))
-        return TrackingPreview.model_validate(parsers.pictures(Path(folder), upload.file.filename or ""))
+        said = upload.options.model_dump(include={"up", "boxes", "depth_scale"})
+        return TrackingPreview.model_validate(
+            parsers.pictures(Path(folder), upload.file.filename or "", said)
+        )
 
 
 def kept_pictures(upload: Upload[TrackingOptions], artifacts: ArtifactStore) -> Artifact:

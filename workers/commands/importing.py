@@ -316,7 +316,7 @@ def _of_camera(text: str) -> tuple[int, str]:
 
 
 def _box(option: str, text: str | None) -> Any:
-    from physworld.tracking.mask import Box
+    from physworld.tracking.view import Box
 
     return None if text is None else Box(*(int(value) for value in numbers(option, text, 4)))
 

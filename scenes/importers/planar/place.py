@@ -11,9 +11,9 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
 from physworld.tracking.boards import Board, find_board
-from physworld.tracking.mask import Box, mask_in_box
+from physworld.tracking.mask import mask_in_box
 from physworld.tracking.plane import Plane, frontal, view_of
-from physworld.tracking.view import View
+from physworld.tracking.view import Box, View
 from physworld_scenes.errors import refused
 from physworld_scenes.importers.axes import ROTATION_FROM_UP
 from physworld_scenes.importers.film import Filmed

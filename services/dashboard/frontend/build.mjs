@@ -17,7 +17,7 @@ rmSync(OUT, { recursive: true, force: true });
 mkdirSync(`${OUT}/licences`, { recursive: true });
 
 await build({
-  entryPoints: ["app.js", "cloud.js", "curve.js", "film.js", "markers.js", "playground.js", "tracking.js", "upload.js", "style.css"].map((name) => `src/${name}`),
+  entryPoints: ["app.js", "cloud.js", "curve.js", "film.js", "first.js", "markers.js", "playground.js", "tracking.js", "upload.js", "style.css"].map((name) => `src/${name}`),
   outdir: OUT,
   bundle: true,
   minify: true,

@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.tracking.measure import followed_exactly
 from physworld.scene import Scene
-from physworld.tracking.mask import Box
+from physworld.tracking.view import Box
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers.options import ImportOptions
 from physworld_scenes.importers.pictures import read_pictures

@@ -10,13 +10,13 @@ from tracking_pictured import BOTTOM, CAMERA, LEFT, NEAR_M, RIGHT, TOP, affine, 
 from tracking_pictured import FRAMES as PLATE_FRAMES
 
 from physworld.tracking.grips import colour_middles
-from physworld.tracking.mask import Box, Outline
+from physworld.tracking.mask import Outline
 from physworld.tracking.neighbours import carried
 from physworld.tracking.places import TrackConfig
 from physworld.tracking.points import Follower
 from physworld.tracking.recording import distinct, patch_points
 from physworld.tracking.rigid import joined, rigid_path
-from physworld.tracking.view import View, back_project
+from physworld.tracking.view import Box, View, back_project
 
 FRAMES = 20
 

@@ -8,10 +8,11 @@ from tracking_pictured import BOTTOM, COVERED, LEFT, RIGHT, TOP, affine, frame_o
 
 from physworld.errors import TrackingFailed
 from physworld.tracking.grips import logged
-from physworld.tracking.mask import Box, mask_in_box
+from physworld.tracking.mask import mask_in_box
 from physworld.tracking.places import TrackConfig
 from physworld.tracking.points import follow
 from physworld.tracking.rigid import kabsch, rigid_path
+from physworld.tracking.view import Box
 
 pytestmark = pytest.mark.slow
 

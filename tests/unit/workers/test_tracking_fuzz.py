@@ -51,6 +51,7 @@ import os, sys, traceback
 from pathlib import Path
 import cv2, scipy.ndimage, scipy.spatial, PIL.Image
 from physworld_scenes.errors import SceneInvalid
+from physworld_scenes.importers.first_cloud import first_cloud
 from physworld_scenes.importers.unpacked import first_pictures, unpacked
 from physworld_workers import tracking_child
 cv2.setNumThreads(1)
@@ -64,7 +65,10 @@ for line in sys.stdin:
             (folder / "seen").mkdir()
             os.link(folder / "upload", folder / "shown")
             try:
-                first_pictures(unpacked(folder / "shown", "take.zip", folder / "seen"))
+                recording = unpacked(folder / "shown", "take.zip", folder / "seen")
+                if first_pictures(recording)[0] == "rgbd":
+                    found = first_cloud(recording, None, {})
+                    assert len(found.places) <= 5000 and abs(found.places).max(initial=0.0) < 1e9
             except SceneInvalid:
                 pass
             status = tracking_child.main(folder)

@@ -8,13 +8,25 @@ import { colour } from "./palette.js";
 
 const VERTEX = `
   uniform float size; uniform float scale;
+  #ifdef TONED
+    attribute vec3 tone;
+    varying vec3 tint;
+  #endif
   void main() {
+    #ifdef TONED
+      tint = tone;
+    #endif
     vec4 view = modelViewMatrix * vec4(position, 1.0);
     gl_Position = projectionMatrix * view;
     gl_PointSize = clamp(size * scale / -view.z, 2.0, 40.0);
   }`;
 const FRAGMENT = `
-  uniform vec3 tint; uniform float opacity;
+  #ifdef TONED
+    varying vec3 tint;
+  #else
+    uniform vec3 tint;
+  #endif
+  uniform float opacity;
   void main() {
     vec2 p = gl_PointCoord * 2.0 - 1.0;
     float r = dot(p, p);
@@ -27,13 +39,15 @@ const FRAGMENT = `
 
 /**
  * The material of round points. The alpha of an opaque point's edge only says how many samples of a pixel the point
- * covers: it is not written into the picture, where it would mix the page's background into the point.
+ * covers: it is not written into the picture, where it would mix the page's background into the point. `toned` points have
+ * a colour each, the attribute `tone`.
  */
-export function roundPoints(size, opacity) {
+export function roundPoints(size, opacity, toned = false) {
   const opaque = opacity === 1;
   return new ShaderMaterial({
     vertexShader: VERTEX,
     fragmentShader: FRAGMENT,
+    defines: toned ? { TONED: "" } : {},
     uniforms: { size: { value: size }, scale: { value: 1 }, tint: { value: new Color() }, opacity: { value: opacity } },
     transparent: !opaque,
     depthWrite: opaque,

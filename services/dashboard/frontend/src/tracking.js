@@ -10,6 +10,8 @@ const FILM = /\.(mp4|mkv|avi)$/i;
 const COLOURS = { object: "--accent", patch: "--warn", held: "--good" };
 /** Half the side of the patch that a click takes, in pixels. */
 const CLICK = 20;
+/** Half the sides of a box that a click in space makes, in pixels. */
+const SPACE_CLICK = 40;
 
 const form = document.querySelector("[data-tracking]");
 const canvas = form.querySelector("canvas");
@@ -20,6 +22,8 @@ let chosen = null;
 let shown = [];
 let picture = null;
 let drag = null;
+let space = null;
+let turn = 0;
 
 const zipped = (tree) => new Promise((done, fail) => zip(tree, { level: 0 }, (error, data) => (error ? fail(error) : done(data))));
 const unzipped = (bytes) => new Promise((done, fail) => unzip(bytes, (error, tree) => (error ? fail(error) : done(tree))));
@@ -65,6 +69,7 @@ function fill(name) {
 }
 
 function draw() {
+  space?.dress(boxes);
   if (!picture) return;
   const pen = canvas.getContext("2d");
   pen.drawImage(picture, 0, 0);
@@ -94,12 +99,68 @@ async function showCamera() {
   draw();
 }
 
+/** What a preview has to know beside the file: which axis points up, and where the object is, which is no ground. */
+function said(object) {
+  const up = form.querySelector('[data-option="up"]').value;
+  return up ? { up, boxes: object } : { boxes: object };
+}
+
+/** The first pictures in space, where they have depth; or why not. */
+async function drawSpace({ cloud, unclouded }) {
+  const figure = form.querySelector("[data-first]");
+  const told = form.querySelector("[data-unclouded]");
+  told.hidden = !unclouded;
+  told.textContent = unclouded ? `The depth is not shown: ${unclouded}.` : "";
+  figure.hidden = !cloud?.places_m.length;
+  if (figure.hidden) return;
+  figure.querySelector("[data-how]").textContent = [`Up is ${cloud.up}.`, ...cloud.warnings.map((one) => `${one}.`)].join(" ");
+  try {
+    const { First } = await import(figure.dataset.first);
+    space ??= new First(figure, take);
+    space.draw(cloud);
+    space.dress(boxes);
+  } catch {
+    figure.hidden = true; // a browser without WebGL draws boxes on the picture all the same
+  }
+}
+
+/** Put the box that is chosen around a pixel of a camera that was clicked in space. */
+async function take(of, [column, row]) {
+  const name = form.querySelector("input[name=draws]:checked").value;
+  if (name !== "object" && of !== 0) return tell(form, "The gripper's boxes are those of camera 0; this point is seen by another.");
+  if (of !== number()) {
+    camera.value = of;
+    await showCamera();
+  }
+  const box = boxes[name][of];
+  const half = name === "patch" ? [CLICK, CLICK] : box ? [(box[2] - box[0]) / 2, (box[3] - box[1]) / 2] : [SPACE_CLICK, SPACE_CLICK];
+  const sides = [column - half[0], row - half[1], column + half[0], row + half[1]].map(Math.round);
+  boxes[name][of] = picture ? inside(sides) : sides;
+  if (name === "patch") form.querySelector("[data-gripper]").value = "patch";
+  fill(name);
+  draw();
+}
+
+/** The part of a box that is in the picture. */
+const inside = ([left, top, right, bottom]) => [
+  Math.max(left, 0), Math.max(top, 0), Math.min(right, canvas.width), Math.min(bottom, canvas.height),
+];
+
+/** Another axis points up: the cloud is turned, what was drawn stays. */
+async function lookAgain() {
+  if (!chosen) return;
+  const mine = (turn += 1);
+  const found = await ask(form, chosen, said(boxes.object), true);
+  if (found && mine === turn) await drawSpace(found);
+}
+
 async function look(file) {
-  const found = await ask(form, file, null);
+  turn += 1;
+  const found = await ask(form, file, said({}));
   if (!found) return;
+  for (const box of Object.values(boxes)) for (const key of Object.keys(box)) delete box[key];
   chosen = file;
   shown = found.cameras;
-  for (const box of Object.values(boxes)) for (const key of Object.keys(box)) delete box[key];
   camera.replaceChildren(...shown.map((one) => new Option(`${one.camera} (${one.name})`, one.camera)));
   camera.closest("label").hidden = shown.length < 2;
   form.querySelector("[data-film]").hidden = found.form !== "film";
@@ -107,6 +168,7 @@ async function look(file) {
   tell(form, `${file.name}: ${shown.length} ${shown.length > 1 ? "cameras" : "camera"}${frames}`);
   form.querySelector("[data-options]").hidden = false;
   await showCamera();
+  await drawSpace(found);
 }
 
 /** Where the mouse is, in pixels of the picture. */
@@ -144,12 +206,12 @@ function optionsOf() {
     else options[input.dataset.option] = value;
   }
   if (Object.keys(body).length) options.body = body;
-  const said = form.querySelector("[data-gripper]").value;
-  if (said !== "none") {
+  const moved = form.querySelector("[data-gripper]").value;
+  if (moved !== "none") {
     options.gripper = {};
-    if (said === "patch") options.gripper.patch = boxes.patch[0] ?? null;
-    if (said === "marker") options.gripper.marker = form.querySelector("[data-marker]").valueAsNumber || 0;
-    if (said === "log") {
+    if (moved === "patch") options.gripper.patch = boxes.patch[0] ?? null;
+    if (moved === "marker") options.gripper.marker = form.querySelector("[data-marker]").valueAsNumber || 0;
+    if (moved === "log") {
       const pose = form.querySelector("[data-log-pose]").value.trim();
       const episode = form.querySelector("[data-log-episode]").valueAsNumber;
       options.gripper.log = logFiles()[0]?.name ?? null;
@@ -189,6 +251,7 @@ form.addEventListener("submit", (event) => {
 });
 form.querySelector("[data-start]").addEventListener("click", start);
 camera.addEventListener("change", showCamera);
+form.querySelector('[data-option="up"]').addEventListener("change", lookAgain);
 for (const name of Object.keys(boxes)) {
   for (const input of corners(name)) {
     input.addEventListener("input", () => {
