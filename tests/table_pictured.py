@@ -1,4 +1,4 @@
-"""A depth camera's pictures of a block on a table, made by rays: where the table lies and how high the block is is known.
+"""A depth camera's pictures of a block on a table, made by rays, so that all places are known.
 
 The camera stands ``HEIGHT_M`` above the table and looks down by ``PITCH_DEG``. In the scene's world, which an import
 finds, the table is z = 0, the origin below the camera, y away from it.

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 from api_service import Service, assert_problem, bundle
 from conftest import MAX_UPLOAD_BYTES
 from PIL import Image
 from planar_filmed import Film
-from tracking_pictured import FRAMES, HEIGHT, WIDTH, write
+from tracking_pictured import BOTTOM, FAR_M, FRAMES, HEIGHT, LEFT, NEAR_M, RIGHT, TOP, WIDTH, write
 
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_scenes.facts import facts_of
@@ -52,6 +53,18 @@ def test_a_preview_shows_the_first_picture_of_each_camera_and_stores_nothing(
     with Image.open(io.BytesIO(base64.b64decode(camera["data"]))) as picture:
         assert picture.size == (WIDTH, HEIGHT) and camera["media_type"] == "image/png"
     assert client.get("/v1/jobs", params={"kind": "tracking"}).json()["data"] == []
+    cloud = found["cloud"]
+    assert found["unclouded"] is None and cloud["ground_m"] is None and "no ground" in cloud["warnings"][0]
+    places, at = np.array(cloud["places_m"]), np.array(cloud["pixels"])
+    assert 0 < len(places) <= 5000 and set(cloud["cameras"]) == {0} and len(cloud["colours"]) == len(places)
+    plate = (at >= (LEFT, TOP)).all(axis=1) & (at < (RIGHT, BOTTOM)).all(axis=1)
+    assert np.allclose(places[plate, 1], NEAR_M) and np.allclose(places[~plate, 1], FAR_M)
+
+
+def test_a_preview_is_turned_as_its_options_say(client: httpx.Client, pictures: bytes) -> None:
+    found = send(client, "/preview", pictures, options=json.dumps({"up": "z", "depth_scale": 2000.0})).json()
+    assert found["cloud"]["up"] == "z of the cameras' world, given"
+    assert np.isclose(np.array(found["cloud"]["places_m"])[:, 2].max(), FAR_M / 2)
 
 
 def test_a_film_shows_its_first_frame(client: httpx.Client, tmp_path: Path) -> None:
@@ -59,6 +72,7 @@ def test_a_film_shows_its_first_frame(client: httpx.Client, tmp_path: Path) -> N
     found = send(client, "/preview", film, "strip.mp4").json()
     (camera,) = found["cameras"]
     assert (found["form"], camera["media_type"]) == ("film", "image/jpeg")
+    assert found["cloud"] is None and found["unclouded"] is None
     with Image.open(io.BytesIO(base64.b64decode(camera["data"]))) as picture:
         assert picture.size == (480, 360)
 

@@ -6,8 +6,8 @@ import { colour, onSchemeChange } from "./palette.js";
 import { roundPoints, segments } from "./points.js";
 import { View } from "./view.js";
 
-const DIRECTION = [0.4, -1, 0.42]; // from the middle of what is seen to the view; a single camera looks along y
-const TRIMMED = 0.04; // of the points, the farthest at each end of each axis, are not what the view is laid around
+const DIRECTION = [0.18, -1, 0.5]; // from the middle of what is seen to the view; a single camera looks along y
+const TRIMMED = 0.12; // of the points, the farthest at each end of each axis, are not what the view is laid around
 const NEAR_PX = 10; // of the pointer to a point that it means
 const CLICK_PX = 4; // that a click may move; more turns the view
 const SHARE = 0.018; // of the radius, the size of a point

@@ -117,6 +117,7 @@ async function drawSpace({ cloud, unclouded }) {
   try {
     const { First } = await import(figure.dataset.first);
     space ??= new First(figure, take);
+    window.viewer = space; // for tests, which have no other way to see where a point is drawn
     space.draw(cloud);
     space.dress(boxes);
   } catch {
