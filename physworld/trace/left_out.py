@@ -30,6 +30,7 @@ from physworld.estimation.refit import prior_rows
 from physworld.estimation.unknowns import Unknown, bounds_of
 
 NOISE_KNOWN = 0.2  # share to which the variance of the noise is known: its deviation to a tenth
+_FINER = 2.0  # ratio of the weights of priors that are compared
 _WEAKEST = 1e-9  # of the normal matrix's diagonal: keeps it invertible where data say nothing of an unknown
 
 
@@ -103,6 +104,37 @@ def left_out(linear: Linear, blocks: Sequence[Array], scale: float) -> LeftOut:
         blocks: rows of every block of frames, B arrays.
         scale: deviations of the noise that a sighting counts as, for the weight of the priors.
     """
+    return _predicted(linear, blocks, scale, settled=True)
+
+
+def best_scale(linear: Linear, blocks: Sequence[Array], most: float) -> float:
+    """Deviations of the noise that a sighting counts as beside the priors: ``most``, or a half of it, a quarter and so
+    on down to 1; the largest under which left-out blocks are predicted as well as under the best, to one standard error.
+
+    How well a mean square is known says how many independent numbers tell it, and so how many tell two hypotheses
+    apart. How far a prior may be followed is another question: an error that all points share at once, or one that
+    comes back in every block, leaves the other directions of the data as they are.
+
+    Args:
+        linear: about its optimum under any of these.
+        blocks: rows of every block of frames.
+        most: what a sighting counts as between hypotheses.
+    """
+    steps = int(np.ceil(np.log(max(most, 1.0)) / np.log(_FINER)))
+    scales = [*(most / _FINER**k for k in range(steps)), 1.0]
+    found = [_predicted(linear, blocks, scale, settled=False) for scale in scales]
+    best = min(found, key=lambda one: one.mean)
+    return float(next(s for s, one in zip(scales, found, strict=True) if _as_good(one, best)))
+
+
+def _as_good(one: LeftOut, best: LeftOut) -> bool:
+    """Whether errors exceed those of the best by no more than the standard error of their difference over the blocks."""
+    more = one.errors - best.errors
+    return bool(np.average(more, weights=one.sizes) <= np.std(more) / np.sqrt(len(more)))
+
+
+def _predicted(linear: Linear, blocks: Sequence[Array], scale: float, settled: bool) -> LeftOut:
+    """See :func:`left_out`; ``settled``: the place is the optimum under this ``scale``."""
     residual, jacobian = linear.residual / scale, linear.jacobian / scale
     prior_residual, prior_slope = prior_rows(linear.unknowns, linear.theta)
     normals = [jacobian[rows].T @ jacobian[rows] for rows in blocks]
@@ -110,7 +142,8 @@ def left_out(linear: Linear, blocks: Sequence[Array], scale: float) -> LeftOut:
     count = len(linear.unknowns)
     normal = sum(normals, np.zeros((count, count))) + prior_slope.T @ prior_slope
     gradient = sum(gradients, np.zeros(count)) + prior_slope.T @ prior_residual
-    gradient[unbound(linear)] = 0.0  # what a search has left of it is no fault of the block that is left out
+    if settled:
+        gradient[unbound(linear)] = 0.0  # what a search has left of it is no fault of the block that is left out
     weakest = np.diag(_WEAKEST * np.diag(normal) + 1e-30)
     errors = []
     for k, rows in enumerate(blocks):

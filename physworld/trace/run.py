@@ -166,8 +166,11 @@ class _Trace:
         ground = self._ground()
         declared = self._declared(ground)
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
-        setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
-        starts = Starts(setting, early_part(ground.bare, self.split))
+        setting = replace(
+            self._setting(ground, declared.fitted.twin, declared.fitted.unknowns),
+            share=declared.scale / declared.unseen.scale,
+        )
+        starts = Starts(setting, early_part(ground.bare, self.split), self._beginning())
         sizes = (config.confirmed, config.additions, config.effects_at_most)
         search = Search(setting, chosen, starts, *sizes, config.seed)
         self.clock.start()
@@ -262,13 +265,17 @@ class _Trace:
         setting = self._setting(ground, self.twin, unknowns)
         thorough = replace(setting, iterations=_THOROUGH * self.config.iterations)
         scale = thorough.counted(float(np.mean(ground.white.residual(ground.tracks) ** 2)))
-        start = {u.name: u.start for u in unknowns}
+        start = self._beginning()
         places = [place for about in elsewhere(unknowns, start) for place in about]
         places.append(start | {u.name: u.prior[0] for u in hold_unknowns(self.twin) if u.prior})
         declared = thorough.fitted((), start, places, scale=scale)
         if declared is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
         return declared
+
+    def _beginning(self) -> dict[str, float]:
+        """Where the calibration ended, by name."""
+        return {u.name: u.start for u in self._unknowns()}
 
     def _setting(self, ground: _Ground, twin: Twin, unknowns: Sequence[Unknown]) -> Setting:
         known = (self.simulations, ground.white, ground.whitening, ground.blocks, self.frames)

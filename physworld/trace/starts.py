@@ -62,10 +62,13 @@ class Starts:
     Attributes:
         setting: what all hypotheses share.
         early: whitener of the first part of the training frames, by the noise alone, and their end.
+        calibrated: where the calibration ended, by name: of a rod beside its losses, without which the declared physics
+            comes to rest elsewhere.
     """
 
     setting: Setting
     early: tuple[Whitener, int]
+    calibrated: Values
 
     def begun(self, base: Hypothesis, one: Screened, basins: Sequence[Hypothesis], far: float = 0.0) -> Begun:
         """The best of the near starts, and of the far ones, of different stiffnesses.
@@ -123,14 +126,13 @@ class Starts:
         )
         return unknowns, places, [self._error(tracks) for tracks in runs]
 
-    @staticmethod
-    def _near(base: Hypothesis, one: Screened, basins: Sequence[Hypothesis]) -> list[Values]:
+    def _near(self, base: Hypothesis, one: Screened, basins: Sequence[Hypothesis]) -> list[Values]:
         linear = {**base.values, **one.values}
         strengths = {u.name: linear[u.name] for u in one.candidate.unknowns()}
         starts: list[Values] = [linear, {**base.values, **strengths}]
         starts += [{**linear, **{n: f * s for n, s in strengths.items()}} for f in _MULTIPLES]
-        for other in basins:
-            kept = {n: v for n, v in other.values.items() if n in base.values}
+        for other in (self.calibrated, *(basin.values for basin in basins)):
+            kept = {n: v for n, v in other.items() if n in base.values}
             starts += [
                 {**base.values, **kept, **{n: f * s for n, s in strengths.items()}} for f in (1.0, 0.3, 3.0)
             ]
