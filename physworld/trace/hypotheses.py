@@ -178,7 +178,7 @@ class Setting:
             new = Hypothesis(tuple(members), plain, left_out(linear, self.blocks, scale), own, scale)
             if found is None or new.left <= found.left:
                 found = new
-            following = best_scale(linear, self.blocks, new.unseen.scale)
+            following = best_scale(linear, self.blocks, scale, new.unseen.scale)
             if number and max(scale, following) <= _SAME * min(scale, following):
                 break
             if float(np.sum(plain.residual**2)) > hopeless:

@@ -104,10 +104,10 @@ def left_out(linear: Linear, blocks: Sequence[Array], scale: float) -> LeftOut:
         blocks: rows of every block of frames, B arrays.
         scale: deviations of the noise that a sighting counts as, for the weight of the priors.
     """
-    return _predicted(linear, blocks, scale, settled=True)
+    return _predicted(linear, blocks, scale, scale)
 
 
-def best_scale(linear: Linear, blocks: Sequence[Array], most: float) -> float:
+def best_scale(linear: Linear, blocks: Sequence[Array], scale: float, most: float) -> float:
     """Deviations of the noise that a sighting counts as beside the priors: ``most``, or a half of it, a quarter and so
     on down to 1; the largest under which left-out blocks are predicted as well as under the best, to one standard error.
 
@@ -116,13 +116,14 @@ def best_scale(linear: Linear, blocks: Sequence[Array], most: float) -> float:
     comes back in every block, leaves the other directions of the data as they are.
 
     Args:
-        linear: about its optimum under any of these.
+        linear: about its optimum.
         blocks: rows of every block of frames.
+        scale: under which that is the optimum.
         most: what a sighting counts as between hypotheses.
     """
     steps = int(np.ceil(np.log(max(most, 1.0)) / np.log(_FINER)))
     scales = [*(most / _FINER**k for k in range(steps)), 1.0]
-    found = [_predicted(linear, blocks, scale, settled=False) for scale in scales]
+    found = [_predicted(linear, blocks, scale, other) for other in scales]
     best = min(found, key=lambda one: one.mean)
     return float(next(s for s, one in zip(scales, found, strict=True) if _as_good(one, best)))
 
@@ -133,17 +134,19 @@ def _as_good(one: LeftOut, best: LeftOut) -> bool:
     return bool(np.average(more, weights=one.sizes) <= np.std(more) / np.sqrt(len(more)))
 
 
-def _predicted(linear: Linear, blocks: Sequence[Array], scale: float, settled: bool) -> LeftOut:
-    """See :func:`left_out`; ``settled``: the place is the optimum under this ``scale``."""
-    residual, jacobian = linear.residual / scale, linear.jacobian / scale
+def _predicted(linear: Linear, blocks: Sequence[Array], scale: float, other: float) -> LeftOut:
+    """Errors of every block, where a sighting counts as ``other``, about the optimum under ``scale``."""
+    residual, jacobian = linear.residual / other, linear.jacobian / other
     prior_residual, prior_slope = prior_rows(linear.unknowns, linear.theta)
     normals = [jacobian[rows].T @ jacobian[rows] for rows in blocks]
     gradients = [jacobian[rows].T @ residual[rows] for rows in blocks]
     count = len(linear.unknowns)
     normal = sum(normals, np.zeros((count, count))) + prior_slope.T @ prior_slope
-    gradient = sum(gradients, np.zeros(count)) + prior_slope.T @ prior_residual
-    if settled:
-        gradient[unbound(linear)] = 0.0  # what a search has left of it is no fault of the block that is left out
+    pull = prior_slope.T @ prior_residual
+    gradient = sum(gradients, np.zeros(count)) + pull
+    # data and priors balance at an optimum; what a search has left of it is no fault of the block that is left out
+    free = unbound(linear)
+    gradient[free] = (1.0 - (scale / other) ** 2) * pull[free]
     weakest = np.diag(_WEAKEST * np.diag(normal) + 1e-30)
     errors = []
     for k, rows in enumerate(blocks):
