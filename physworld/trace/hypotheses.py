@@ -1,7 +1,8 @@
 """A hypothesis: a set of effects beside the calibrated numbers, fitted and held against left-out blocks of frames.
 
-A fit weighs the residual against the priors by how much a sighting counts (:mod:`physworld.trace.left_out`): where a
-twin errs by a hundred times a camera's noise, ten thousand sightings do not fix a stiffness to a part in a million.
+A fit weighs the residual against the priors by how much a sighting counts (:mod:`physworld.estimation.left_out`):
+where a twin errs by a hundred times a camera's noise, ten thousand sightings do not fix a stiffness to a part in a
+million.
 
 Nothing here knows what an effect is: its numbers, their bounds and priors, its shapes and their mirror images come from
 the effect's own file by way of the candidates.
@@ -16,12 +17,12 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.errors import SimulationError
+from physworld.estimation.left_out import LeftOut, Linear, best_scale, counted, left_out
 from physworld.estimation.refit import Refit, prior_rows, refit
 from physworld.estimation.simulations import Job
 from physworld.estimation.unknowns import Unknown, at
 from physworld.estimation.whitening import ScaledWhitener, Whitener
 from physworld.trace.candidates import Candidate
-from physworld.trace.left_out import LeftOut, Linear, best_scale, counted, left_out
 from physworld.trace.recordings import JointSimulations
 from physworld.twin.twin import Twin
 

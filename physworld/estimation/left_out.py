@@ -10,10 +10,13 @@ left-out error e of which 1 is noise, M numbers in B blocks tell its mean as wel
 
     n(e) = 1 / ((1 / e)^2 / M + (1 - 1 / e)^2 / B)
 
-independent numbers would (the variance of a mean square is the sum of its parts' variances). So everything that weighs
-data against priors, or one hypothesis against another, counts n numbers instead of M: the likelihood is tempered
-(Miller and Dunson 2019, "Robust Bayesian inference via coarsening"), by a number that the data give. Between
-hypotheses it is n(e + 0.2), for that much error of the twin may hide in a noise whose variance is known to a fifth.
+independent numbers would (the variance of a mean square is the sum of its parts' variances). So what weighs one
+hypothesis against another counts n numbers instead of M: the likelihood is tempered (Miller and Dunson 2019, "Robust
+Bayesian inference via coarsening"), by a number that the data give. Between hypotheses it is n(e + 0.2), for that much
+error of the twin may hide in a noise whose variance is known to a fifth.
+
+How far data move the unknowns from their priors is another question, for an error that all points share leaves other
+directions of the data as they are. A fit counts n numbers or more: as few as predict left-out blocks as well as any.
 """
 
 from __future__ import annotations
@@ -109,11 +112,7 @@ def left_out(linear: Linear, blocks: Sequence[Array], scale: float) -> LeftOut:
 
 def best_scale(linear: Linear, blocks: Sequence[Array], scale: float, most: float) -> float:
     """Deviations of the noise that a sighting counts as beside the priors: ``most``, or a half of it, a quarter and so
-    on down to 1; the largest under which left-out blocks are predicted as well as under the best, to one standard error.
-
-    How well a mean square is known says how many independent numbers tell it, and so how many tell two hypotheses
-    apart. How far a prior may be followed is another question: an error that all points share at once, or one that
-    comes back in every block, leaves the other directions of the data as they are.
+    on down to 1: the largest under which left-out blocks are predicted as well as under any, to one standard error.
 
     Args:
         linear: about its optimum.
@@ -129,7 +128,7 @@ def best_scale(linear: Linear, blocks: Sequence[Array], scale: float, most: floa
 
 
 def _as_good(one: LeftOut, best: LeftOut) -> bool:
-    """Whether errors exceed those of the best by no more than the standard error of their difference over the blocks."""
+    """Whether errors exceed the best ones by no more than the standard error of the difference over the blocks."""
     more = one.errors - best.errors
     return bool(np.average(more, weights=one.sizes) <= np.std(more) / np.sqrt(len(more)))
 
