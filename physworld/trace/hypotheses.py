@@ -86,7 +86,8 @@ class Setting:
     Attributes:
         simulations: of the recordings.
         white: by noise, places and solver, of the calibrated twin.
-        whitening: the same of a twin whose tracked points answer so to their own places, (frames, N, 3, r).
+        whitening: the same of a twin whose tracked points answer so to their own places, (frames, N, 3, r), and of its
+            tracks.
         blocks: rows of every block of frames.
         frames: from the first to before this one.
         iterations: of a fit.
@@ -97,7 +98,7 @@ class Setting:
 
     simulations: JointSimulations
     white: Whitener
-    whitening: Callable[[Array], Whitener]
+    whitening: Callable[[Array, Array], Whitener]
     blocks: Sequence[Array]
     frames: int
     iterations: int
@@ -172,7 +173,7 @@ class Setting:
             )
             if done is None:
                 return found
-            own = self._own(done.twin) or white
+            own = self._own(done) or white
             slopes = own.over_from(white, scale * done.jacobian)
             plain = replace(done, residual=own.residual(done.tracks), jacobian=slopes)
             linear = Linear(plain.residual, plain.jacobian, plain.unknowns, plain.theta)
@@ -188,9 +189,9 @@ class Setting:
             known = plain.jacobian / scale
         return found
 
-    def _own(self, twin: Twin) -> Whitener | None:
+    def _own(self, done: Refit) -> Whitener | None:
         """The whitener of a twin's own motion; None where that cannot be trusted."""
         try:
-            return self.whitening(self.simulations.first_look(Job(twin, self.frames))[1])
+            return self.whitening(self.simulations.first_look(Job(done.twin, self.frames))[1], done.tracks)
         except SimulationError:
             return None
