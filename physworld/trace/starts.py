@@ -26,6 +26,7 @@ from physworld.trace.screening import Screened
 
 _EARLY = 0.4  # share of the training frames on which starts are ranked
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
+_SCANNED = (0.3, 0.1, 0.03, 0.01)  # of a strength's range, beside the numbers of the calibration
 _PROFILE = (
     5,
     2,
@@ -131,12 +132,19 @@ class Starts:
         strengths = {u.name: linear[u.name] for u in one.candidate.unknowns()}
         starts: list[Values] = [linear, {**base.values, **strengths}]
         starts += [{**linear, **{n: f * s for n, s in strengths.items()}} for f in _MULTIPLES]
-        for other in (self.calibrated, *(basin.values for basin in basins)):
-            kept = {n: v for n, v in other.items() if n in base.values}
+        for other in basins:
+            kept = {n: v for n, v in other.values.items() if n in base.values}
             starts += [
                 {**base.values, **kept, **{n: f * s for n, s in strengths.items()}} for f in (1.0, 0.3, 3.0)
             ]
-        return starts
+        # where the calibration ended, what is estimated elsewhere only has a direction
+        kept = {n: v for n, v in self.calibrated.items() if n in base.values}
+        ranges = {u.name: max(abs(end) for end in u.bounds) for u in one.candidate.unknowns()}
+        largest = max((abs(s) / ranges[n] for n, s in strengths.items()), default=1.0) or 1.0
+        return starts + [
+            {**base.values, **kept, **{n: share / largest * s for n, s in strengths.items()}}
+            for share in _SCANNED
+        ]
 
     def _profiled(self, base: Hypothesis, one: Screened, share: float) -> list[Values]:
         """One Gauss-Newton step of the strengths alone on the early frames, beside other stiffnesses, and beside fewer
