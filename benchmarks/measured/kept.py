@@ -1,4 +1,4 @@
-"""Fitted spring–mass networks kept beside a benchmark's JSON: they take minutes, and a transfer asks for them again."""
+"""Fitted spring–mass networks kept beside a benchmark's JSON: they take minutes."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def measure(name: str, scene: Scene, config: CalibrationConfig, steps: Path) -> 
         steps: folder of the fit's finished steps, where its twin is kept too.
     """
     begun = time.perf_counter()
-    models, unfit = scoring.fit_all(scene, steps)
+    models, unfit = scoring.fit_all(scene)
     tracks, reasons = scoring.predict(scene, models)
     reasons |= unfit
     tracks |= dict.fromkeys(unfit)
@@ -92,7 +92,7 @@ def transfer(
         own: held-out track errors of this recording's own predictors [m].
     """
     whole: scoring.Predictions
-    models, unfit = scoring.fit_all(source, twin.parent)
+    models, unfit = scoring.fit_all(source)
     whole, reasons = scoring.predict(scene, {name: model for name, model in models.items() if name != COPIES})
     reasons |= unfit
     whole |= dict.fromkeys(unfit)

@@ -19,12 +19,10 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.measured.kept import fitted as kept_or_fitted
 from physworld.arrays import Array
 from physworld.baselines import PEERS
 from physworld.errors import PhysworldError
@@ -36,6 +34,7 @@ from physworld.twin.twin import Twin
 
 HORIZONS_S = (0.5, 1.0, 2.0, 5.0)
 WHOLE = "whole"
+SPRINGS = ("phystwin", "spring_gaus")
 LEAST_COVERING = 6
 """Tracked points of a rope or sheet from which its shape at a later frame is known well enough to start there."""
 
@@ -54,22 +53,21 @@ FAILURES = (
 
 
 def fits() -> dict[str, Fit]:
-    """Everything beside the twin, by name: what does nothing first, then other people's models."""
-    return {name: partial(_as_it_is, baseline) for name, baseline in BASELINES.items()} | PEERS
+    """Everything beside the twin, by name: what does nothing first, then other people's models.
 
-
-def fit_all(scene: Scene, folder: Path | None = None) -> tuple[dict[str, Model], Reasons]:
-    """Every model that could be fitted to the training frames, and why the others could not.
-
-    Args:
-        scene: the recording.
-        folder: where networks that take minutes are kept (:mod:`benchmarks.measured.kept`).
+    But not those that take minutes to fit, which have a command of their own (:mod:`benchmarks.measured.springs`).
     """
+    peers = {name: fit for name, fit in PEERS.items() if name not in SPRINGS}
+    return {name: partial(_as_it_is, baseline) for name, baseline in BASELINES.items()} | peers
+
+
+def fit_all(scene: Scene) -> tuple[dict[str, Model], Reasons]:
+    """Every model that could be fitted to the training frames, and why the others could not."""
     models: dict[str, Model] = {}
     reasons: Reasons = {}
     for name, fit in fits().items():
         try:
-            models[name] = kept_or_fitted(name, fit, scene, folder)
+            models[name] = fit(scene)
         except FAILURES as error:
             reasons[name] = words(error)
     return models, reasons

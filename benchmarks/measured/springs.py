@@ -110,7 +110,7 @@ def measure(
             return scoring.tracks_of(settled, of)
     else:
         try:
-            model = fitted(predictor, scoring.fits()[predictor], scene, steps)
+            model = fitted(predictor, scoring.fits().get(predictor) or scoring.PEERS[predictor], scene, steps)
         except scoring.FAILURES as error:
             return {"reason": scoring.words(error)}
         fit = {"fit_s": time.perf_counter() - begun, "simulations": None}

@@ -29,12 +29,12 @@ from physworld.check import CheckConfig, CheckResult, check
 from physworld.check.information import POSTERIOR
 from physworld.check.physics import Physics, declared_physics
 from physworld.check.recorded import Recorded, recorded
+from physworld.estimation.left_out import Linear
 from physworld.estimation.refit import Refit, prior_rows, refit
 from physworld.estimation.simulations import Drive, Simulations
 from physworld.estimation.unknowns import at, bounds_of, starts_of
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.trace.candidates import Candidate, candidates
-from physworld.trace.left_out import Linear
 from physworld.trace.sensitivity import candidate_responses
 
 STIFFNESS_PA, FRAMES, FPS = 6e4, 30, 30.0

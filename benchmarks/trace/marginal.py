@@ -12,8 +12,8 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.check.discrepancy import Discrepancy
+from physworld.estimation.left_out import Linear, unbound
 from physworld.estimation.refit import prior_rows
-from physworld.trace.left_out import Linear, unbound
 
 _LEVELS = 28  # amplitudes that are tried, beside none
 _LEAST, _MOST = 0.05, 3e4  # of the noise

@@ -169,13 +169,37 @@ class Whitener:
             out[place.rows] = (block + place.basis @ grown).reshape(-1, 3)
         return out
 
-    def knowing(self, differences: list[Array]) -> Whitener:
-        """With changes of the prediction, (frames, N, 3) each, that are as likely as not: one deviation each."""
+    def knowing(self, differences: list[Array], error: float = 1.0) -> Whitener:
+        """With changes of the prediction, (frames, N, 3) each, that are as likely as not: one deviation each.
+
+        Args:
+            differences: the changes.
+            error: see :meth:`beside`, by which the places have been taken already.
+        """
         if not differences:
             return self
         factors = np.stack([self.change(difference) for difference in differences], axis=1)
         u, s, _ = np.linalg.svd(factors, full_matrices=False)
-        return replace(self, common=(u, 1.0 - 1.0 / np.sqrt(1.0 + s**2)))
+        return replace(self, common=(u, _shrink(s / np.sqrt(error))))
+
+    def beside(self, error: float) -> Whitener:
+        """Beside an error of the model in every sighting, I + G G^T / error: places are no less certain for it, and are
+        not blamed for what is larger than they are.
+
+        Args:
+            error: mean squared residual over the noise's, 1 for a perfect model.
+        """
+        places = (
+            replace(place, shrink=_shrink(np.sqrt(((1.0 - place.shrink) ** -2 - 1.0) / error)))
+            for place in self.places
+        )
+        return replace(self, places=tuple(places))
+
+
+def _shrink(s: Array) -> Array:
+    """What whitening takes from directions along which the covariance is 1 + s^2."""
+    taken: Array = 1.0 - 1.0 / np.sqrt(1.0 + s**2)
+    return taken
 
 
 @dataclass(frozen=True)
@@ -223,7 +247,7 @@ def whitener(scene: Scene, split: Split, sigma: float, responses: Array) -> Whit
         rows = np.nonzero(points == point)[0]
         response = responses[first:end][visible[:, point], point].reshape(3 * len(rows), responses.shape[-1])
         u, s, _ = np.linalg.svd(response, full_matrices=False)
-        places.append(Place(rows, response, u, 1.0 - 1.0 / np.sqrt(1.0 + s**2)))
+        places.append(Place(rows, response, u, _shrink(s)))
     measured = scene.points[first:end][visible]
     return Whitener(
         measured,

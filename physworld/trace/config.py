@@ -39,7 +39,7 @@ class TraceConfig:
     shortest_block: int = 3
     confirmed: int = 8
     additions: int = 2
-    iterations: int = 5
+    iterations: int = 8
     effects_at_most: int = 3
     refinement: float = 1.4
     bootstraps: int = 1000

@@ -1,7 +1,8 @@
 """A hypothesis: a set of effects beside the calibrated numbers, fitted and held against left-out blocks of frames.
 
-A fit weighs the residual against the priors by how much a sighting counts (:mod:`physworld.trace.left_out`): where a
-twin errs by a hundred times a camera's noise, ten thousand sightings do not fix a stiffness to a part in a million.
+A fit weighs the residual against the priors by how much a sighting counts (:mod:`physworld.estimation.left_out`):
+where a twin errs by a hundred times a camera's noise, ten thousand sightings do not fix a stiffness to a part in a
+million.
 
 Nothing here knows what an effect is: its numbers, their bounds and priors, its shapes and their mirror images come from
 the effect's own file by way of the candidates.
@@ -16,12 +17,12 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.errors import SimulationError
+from physworld.estimation.left_out import LeftOut, Linear, best_scale, counted, left_out
 from physworld.estimation.refit import Refit, prior_rows, refit
 from physworld.estimation.simulations import Job
 from physworld.estimation.unknowns import Unknown, at
 from physworld.estimation.whitening import ScaledWhitener, Whitener
 from physworld.trace.candidates import Candidate
-from physworld.trace.left_out import LeftOut, Linear, counted, left_out
 from physworld.trace.recordings import JointSimulations
 from physworld.twin.twin import Twin
 
@@ -40,12 +41,14 @@ class Hypothesis:
         fitted: the optimum; residual and Jacobian are whitened by ``white``.
         unseen: its errors on left-out blocks.
         white: by noise, solver, and the points' places as its own motion carries them.
+        scale: deviations of the noise that a sighting counts as beside the priors.
     """
 
     members: tuple[Candidate, ...]
     fitted: Refit
     unseen: LeftOut
     white: Whitener
+    scale: float
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -83,22 +86,25 @@ class Setting:
     Attributes:
         simulations: of the recordings.
         white: by noise, places and solver, of the calibrated twin.
-        whitening: the same of a twin whose tracked points answer so to their own places, (frames, N, 3, r).
+        whitening: the same of a twin whose tracked points answer so to their own places, (frames, N, 3, r), and of its
+            tracks.
         blocks: rows of every block of frames.
         frames: from the first to before this one.
         iterations: of a fit.
         twin: of the declared physics.
         calibrated: unknowns that every hypothesis has.
+        share: of what a sighting counts as between hypotheses, what it counts as beside the priors, as a first guess.
     """
 
     simulations: JointSimulations
     white: Whitener
-    whitening: Callable[[Array], Whitener]
+    whitening: Callable[[Array, Array], Whitener]
     blocks: Sequence[Array]
     frames: int
     iterations: int
     twin: Twin
     calibrated: Sequence[Unknown]
+    share: float = 1.0
 
     def assembled(
         self, members: Sequence[Candidate], values: Values, shapes: bool = True
@@ -120,8 +126,8 @@ class Setting:
         return twin, unknowns
 
     def counted(self, error: float) -> float:
-        """Deviations of the noise that a sighting counts as at a mean squared residual of ``error``."""
-        return counted(error, sum(len(rows) for rows in self.blocks), len(self.blocks))
+        """Deviations of the noise that a sighting counts as at a mean squared residual of ``error``, a first guess."""
+        return max(1.0, self.share * counted(error, sum(len(rows) for rows in self.blocks), len(self.blocks)))
 
     def best_of(
         self, members: Sequence[Candidate], places: Sequence[Values], white: Whitener
@@ -167,14 +173,14 @@ class Setting:
             )
             if done is None:
                 return found
-            own = self._own(done.twin) or white
+            own = self._own(done) or white
             slopes = own.over_from(white, scale * done.jacobian)
             plain = replace(done, residual=own.residual(done.tracks), jacobian=slopes)
             linear = Linear(plain.residual, plain.jacobian, plain.unknowns, plain.theta)
-            new = Hypothesis(tuple(members), plain, left_out(linear, self.blocks, scale), own)
+            new = Hypothesis(tuple(members), plain, left_out(linear, self.blocks, scale), own, scale)
             if found is None or new.left <= found.left:
                 found = new
-            following = new.unseen.scale
+            following = best_scale(linear, self.blocks, scale, new.unseen.scale)
             if number and max(scale, following) <= _SAME * min(scale, following):
                 break
             if float(np.sum(plain.residual**2)) > hopeless:
@@ -183,9 +189,9 @@ class Setting:
             known = plain.jacobian / scale
         return found
 
-    def _own(self, twin: Twin) -> Whitener | None:
+    def _own(self, done: Refit) -> Whitener | None:
         """The whitener of a twin's own motion; None where that cannot be trusted."""
         try:
-            return self.whitening(self.simulations.first_look(Job(twin, self.frames))[1])
+            return self.whitening(self.simulations.first_look(Job(done.twin, self.frames))[1], done.tracks)
         except SimulationError:
             return None

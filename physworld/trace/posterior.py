@@ -1,10 +1,10 @@
 """Posterior of hypotheses: how often each would predict unseen blocks best, were the blocks drawn again.
 
 Blocks of frames get Dirichlet weights (the Bayesian bootstrap), each hypothesis its weighted left-out error e, and with
-n independent numbers (:mod:`physworld.trace.left_out`) of a variance that nobody knows the log likelihood -n/2 log e.
-The softmax of that and the log prior is averaged over the draws, as pseudo-BMA+ does it (Yao, Vehtari, Simpson and
-Gelman 2018). So a hypothesis that wins in a few blocks only does not win by much, and the odds mean what they say
-although no twin is the truth.
+n independent numbers (:mod:`physworld.estimation.left_out`) of a variance that nobody knows the log likelihood
+-n/2 log e. The softmax of that and the log prior is averaged over the draws, as pseudo-BMA+ does it (Yao, Vehtari,
+Simpson and Gelman 2018). So a hypothesis that wins in a few blocks only does not win by much, and the odds mean what
+they say although no twin is the truth.
 
 Prior: an effect acts with odds of one to one, whichever of the library it is, but for those whose file says otherwise;
 so k effects of n have (2 n)^-k. Beside it stands the prior density of the strengths, over that at their mean.
@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.trace.left_out import NOISE_KNOWN, LeftOut
+from physworld.estimation.left_out import NOISE_KNOWN, LeftOut
 
 MOST = 0.42  # share of the root mean square, two thirds of the square: what an effect removes to be named
 _DRAWS = 4000

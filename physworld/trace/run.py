@@ -49,6 +49,7 @@ from physworld.trace.unknowns import KNOWN_BEFOREHAND, hold_unknowns, of_paramet
 from physworld.twin.twin import Twin
 
 _THOROUGH = 2  # times the iterations of other fits: everything is compared with the declared physics
+_SETTLING = 5  # rounds in turn of an error and of what places and solver take of it
 _SLOWEST = 12.0  # times the cost of the declared physics that a run may take: strong friction is dear
 _RICHARDSON = {"finer cells": 2.04, "half the time step": 1.33}  # error over difference, of second order
 
@@ -123,7 +124,7 @@ class _Ground:
 
     Attributes:
         bare, white: whiteners without and with the solver's own error, of the calibrated twin.
-        whitening: the second of a motion whose points answer so to their places, (frames, N, 3, r).
+        whitening: the second of a motion whose points answer so to their places, (frames, N, 3, r), and of its tracks.
         blocks: rows of every block of frames.
         sigma: noise [m]; None where it is not known.
         numerics: root mean squared change by other cells and steps, over the noise, by name.
@@ -133,7 +134,7 @@ class _Ground:
 
     bare: Whitener
     white: Whitener
-    whitening: Callable[[Array], Whitener]
+    whitening: Callable[[Array, Array], Whitener]
     blocks: list[Array]
     sigma: float | None
     numerics: dict[str, float]
@@ -166,8 +167,11 @@ class _Trace:
         ground = self._ground()
         declared = self._declared(ground)
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
-        setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
-        starts = Starts(setting, early_part(ground.bare, self.split))
+        setting = replace(
+            self._setting(ground, declared.fitted.twin, declared.fitted.unknowns),
+            share=declared.scale / declared.unseen.scale,
+        )
+        starts = Starts(setting, early_part(ground.bare, self.split), self._beginning())
         sizes = (config.confirmed, config.additions, config.effects_at_most)
         search = Search(setting, chosen, starts, *sizes, config.seed)
         self.clock.start()
@@ -246,10 +250,15 @@ class _Trace:
         doubt = [_RICHARDSON[n] * d for n, d in directions.items() if n in _RICHARDSON]
         also = [*self._doubtful(tracks, scale), *doubt]
 
-        def whitening(answers: Array) -> Whitener:
-            return whitener(self.scene, self.split, scale, answers).knowing(also)
+        def whitening(answers: Array, tracks: Array) -> Whitener:
+            plain, error = whitener(self.scene, self.split, scale, answers), 1.0
+            white = plain.knowing(also)
+            for _ in range(_SETTLING):
+                error = max(1.0, float(np.mean(white.residual(tracks) ** 2)))
+                white = plain.beside(error).knowing(also, error)
+            return white
 
-        white = whitening(answers)
+        white = whitening(answers, tracks)
         block_of_row = self.split.block_of(white.frame_of_row)
         blocks = [np.flatnonzero(block_of_row == k) for k in range(self.split.blocks)]
         blocks = [rows for rows in blocks if len(rows)]
@@ -262,13 +271,17 @@ class _Trace:
         setting = self._setting(ground, self.twin, unknowns)
         thorough = replace(setting, iterations=_THOROUGH * self.config.iterations)
         scale = thorough.counted(float(np.mean(ground.white.residual(ground.tracks) ** 2)))
-        start = {u.name: u.start for u in unknowns}
+        start = self._beginning()
         places = [place for about in elsewhere(unknowns, start) for place in about]
         places.append(start | {u.name: u.prior[0] for u in hold_unknowns(self.twin) if u.prior})
         declared = thorough.fitted((), start, places, scale=scale)
         if declared is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
         return declared
+
+    def _beginning(self) -> dict[str, float]:
+        """Where the calibration ended, by name."""
+        return {u.name: u.start for u in self._unknowns()}
 
     def _setting(self, ground: _Ground, twin: Twin, unknowns: Sequence[Unknown]) -> Setting:
         known = (self.simulations, ground.white, ground.whitening, ground.blocks, self.frames)

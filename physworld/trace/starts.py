@@ -26,6 +26,7 @@ from physworld.trace.screening import Screened
 
 _EARLY = 0.4  # share of the training frames on which starts are ranked
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
+_SCANNED = (0.3, 0.1, 0.03, 0.01)  # of a strength's range, beside the numbers of the calibration
 _PROFILE = (
     5,
     2,
@@ -62,10 +63,13 @@ class Starts:
     Attributes:
         setting: what all hypotheses share.
         early: whitener of the first part of the training frames, by the noise alone, and their end.
+        calibrated: where the calibration ended, by name: of a rod beside its losses, without which the declared physics
+            comes to rest elsewhere.
     """
 
     setting: Setting
     early: tuple[Whitener, int]
+    calibrated: Values
 
     def begun(self, base: Hypothesis, one: Screened, basins: Sequence[Hypothesis], far: float = 0.0) -> Begun:
         """The best of the near starts, and of the far ones, of different stiffnesses.
@@ -123,8 +127,7 @@ class Starts:
         )
         return unknowns, places, [self._error(tracks) for tracks in runs]
 
-    @staticmethod
-    def _near(base: Hypothesis, one: Screened, basins: Sequence[Hypothesis]) -> list[Values]:
+    def _near(self, base: Hypothesis, one: Screened, basins: Sequence[Hypothesis]) -> list[Values]:
         linear = {**base.values, **one.values}
         strengths = {u.name: linear[u.name] for u in one.candidate.unknowns()}
         starts: list[Values] = [linear, {**base.values, **strengths}]
@@ -134,7 +137,14 @@ class Starts:
             starts += [
                 {**base.values, **kept, **{n: f * s for n, s in strengths.items()}} for f in (1.0, 0.3, 3.0)
             ]
-        return starts
+        # where the calibration ended, what is estimated elsewhere only has a direction
+        kept = {n: v for n, v in self.calibrated.items() if n in base.values}
+        ranges = {u.name: max(abs(end) for end in u.bounds) for u in one.candidate.unknowns()}
+        largest = max((abs(s) / ranges[n] for n, s in strengths.items()), default=1.0) or 1.0
+        return starts + [
+            {**base.values, **kept, **{n: share / largest * s for n, s in strengths.items()}}
+            for share in _SCANNED
+        ]
 
     def _profiled(self, base: Hypothesis, one: Screened, share: float) -> list[Values]:
         """One Gauss-Newton step of the strengths alone on the early frames, beside other stiffnesses, and beside fewer

@@ -16,7 +16,14 @@ import warp as wp
 from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.rods.chain import Chain
-from physworld.engine.rods.kernels import OPENING, SCALARS, SHRUNK, run_rods
+from physworld.engine.rods.kernels import (
+    OPENING,
+    SCALARS,
+    SHRUNK,
+    enter_interval,
+    next_substep,
+    run_rods,
+)
 from physworld.errors import BlewUp, CFLViolation, ParticlesLeftTheGrid, SceneUnsupported, SimulationError
 from physworld.materials.cable import CableLaw
 
@@ -219,59 +226,64 @@ class Launch:
 
     def stepwise(self, progress: Callable[[int, int], None] | None) -> Array:
         """The run of one rod substep by substep, with its terms."""
-        out = wp.zeros((1, len(self.times), self.shape[1]), dtype=wp.vec3d, device=self.device)
         for frame in range(len(self.times) - 1):
-            self.interval(frame, out)
+            self.interval(frame)
             if progress is not None:
                 progress(frame + 1, len(self.times))
-        found: Array = out.numpy()
+        found: Array = self._out.numpy()
         return found
 
-    def interval(self, frame: int, out: wp.array | None = None) -> Array:
+    def interval(self, frame: int) -> Array:
         """Bring one rod from ``times[frame]`` to the next time; its nodes then, (n, 3) [m].
 
         The first call is of frame 0. A frame may be integrated again, with paths that were written meanwhile
         (``self.path``).
-
-        Args:
-            frame: the interval's number.
-            out: positions at the times, (1, T, n), where they are kept.
         """
         if frame == 0:
             self._begin()
-        terms, steps = self.rods.terms, self._steps(self.times)
-        span, count = float(self.times[frame + 1] - self.times[frame]), int(steps[frame])
-        kept = self._out if out is None else out
-        dt = span / count
-        self._clock.assign(np.array([span, 1.0 / dt, dt]))
-        for term in terms:
-            term.pace(dt)
-        for step, last in ((k, k + 1) for k in range(count)) if terms else ((0, count),):
-            self._counter.assign(np.array([frame, step, count], dtype=np.int32))
-            self.push.zero_()
-            for term in terms:
-                term.launch(self._flat[0], self._flat[1], self._clock, self._counter, self._flat[2])
-            wp.launch(
-                run_rods, dim=1,
-                inputs=[*self.model, *self._numbers, *self._ticks, *self.path, self.push, frame, frame + 1,
-                        step, last, *self.state, *self.scratch],
-                outputs=[kept], device=self.device,
-            )  # fmt: skip
-        for term in terms:
+        count = int(self._counts[frame])
+        for term in self.rods.terms:
+            term.pace(float(self.times[frame + 1] - self.times[frame]) / count)
+        wp.launch(
+            enter_interval, dim=1, inputs=[frame, *self._ticks], outputs=[self._part, self._counter, self._clock],
+            device=self.device,
+        )  # fmt: skip
+        for _ in range(count):
+            wp.capture_launch(self._substep)
+        for term in self.rods.terms:
             term.check(float(self.times[frame + 1]))
         nodes: Array = self.state[0].numpy()[0].copy()
         return nodes
 
     def _begin(self) -> None:
-        """What the intervals of one rod share."""
-        self._flat = [_flat(array) for array in (self.state[0], self.state[1], self.push)]
+        """What the intervals of one rod share: its substep is recorded once and replayed."""
+        terms, flat = self.rods.terms, [_flat(array) for array in (self.state[0], self.state[1], self.push)]
         self._clock = wp.zeros(3, dtype=wp.float64, device=self.device)
         self._counter = wp.zeros(3, dtype=wp.int32, device=self.device)
-        self._numbers = self._numbers_of()
-        self._ticks = self._array(self.times), self._array(self._steps(self.times), wp.int32)
+        self._part = wp.zeros(4, dtype=wp.int32, device=self.device)
+        self._counts = self._steps(self.times)
+        self._ticks = self._array(self.times), self._array(self._counts, wp.int32)
         self._out = wp.zeros((1, len(self.times), self.shape[1]), dtype=wp.vec3d, device=self.device)
-        for term in self.rods.terms:
+        for term in terms:
             term.begin(self.times)
+        inputs = [
+            *self.model,
+            *self._numbers_of(),
+            *self._ticks,
+            *self.path,
+            self.push,
+            self._part,
+            *self.state,
+        ]
+        with wp.ScopedCapture(device=self.device) as capture:
+            self.push.zero_()
+            for term in terms:
+                term.launch(flat[0], flat[1], self._clock, self._counter, flat[2])
+            wp.launch(
+                run_rods, dim=1, inputs=[*inputs, *self.scratch], outputs=[self._out], device=self.device
+            )
+            wp.launch(next_substep, dim=1, outputs=[self._part, self._counter], device=self.device)
+        self._substep = capture.graph
 
     def settle(self) -> None:
         """Let the rods come to rest under their grips as these are at the first time, without friction or creep."""
@@ -293,7 +305,7 @@ class Launch:
         wp.launch(
             run_rods, dim=copies,
             inputs=[*self.model, *numbers, self._array(times), self._array(steps, wp.int32), *path, self.push,
-                    0, len(steps), 0, int(steps.max()), *self.state, *self.scratch],
+                    self._array(np.array([0, len(steps), 0, steps.max()]), wp.int32), *self.state, *self.scratch],
             outputs=[out], device=self.device,
         )  # fmt: skip
         found: Array = out.numpy()

@@ -98,11 +98,8 @@ def run_rods(
     roll: wp.array3d[wp.float64],
     driven: wp.array2d[wp.vec3d],
     push: wp.array2d[wp.vec3d],
-    # which substeps: all, or one of one interval
-    first_knot: int,
-    last_knot: int,
-    first_step: int,
-    last_step: int,
+    # which substeps: of the intervals from the first to before the second those from the third to before the fourth
+    part: wp.array[wp.int32],
     # in, out: state
     x: wp.array2d[wp.vec3d],
     v: wp.array2d[wp.vec3d],
@@ -135,6 +132,10 @@ def run_rods(
     tau_twist = scalars[c, TWIST_RELAXATION_S]
     tau_stretch = scalars[c, STRETCH_RELAXATION_S]
     at = wp.min(c, path.shape[0] - 1)  # copies may share their grips
+    first_knot = part[0]
+    last_knot = part[1]
+    first_step = part[2]
+    last_step = part[3]
     for i in range(1, n):
         e = x[c, i] - x[c, parent[i]]
         length[c, i] = wp.max(wp.length(e), _SHRUNK * rest_length[i])
@@ -399,3 +400,35 @@ def run_rods(
         if last_step >= count:
             for i in range(n):
                 out[c, k + 1, i] = x[c, i]
+
+
+@wp.kernel
+def enter_interval(
+    frame: int,
+    times: wp.array[wp.float64],
+    steps: wp.array[wp.int32],
+    part: wp.array[wp.int32],
+    counter: wp.array[wp.int32],
+    clock: wp.array[wp.float64],
+) -> None:
+    """Set what :func:`run_rods` and terms read before the first substep of an interval."""
+    count = steps[frame]
+    span = times[frame + 1] - times[frame]
+    part[0] = frame
+    part[1] = frame + 1
+    part[2] = 0
+    part[3] = 1
+    counter[0] = frame
+    counter[1] = 0
+    counter[2] = count
+    clock[0] = span
+    clock[2] = span / wp.float64(count)
+    clock[1] = wp.float64(1.0) / clock[2]
+
+
+@wp.kernel
+def next_substep(part: wp.array[wp.int32], counter: wp.array[wp.int32]) -> None:
+    """Go one substep on."""
+    part[2] = part[2] + 1
+    part[3] = part[3] + 1
+    counter[1] = counter[1] + 1

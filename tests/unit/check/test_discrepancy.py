@@ -9,8 +9,8 @@ from scipy.stats import multivariate_normal
 
 from benchmarks.trace.marginal import amplitudes, log_prior, marginal
 from physworld.check.discrepancy import Block, Discrepancy
+from physworld.estimation.left_out import Linear
 from physworld.estimation.unknowns import Unknown
-from physworld.trace.left_out import Linear
 
 SIGMA = 1e-3
 

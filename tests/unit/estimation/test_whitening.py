@@ -27,15 +27,17 @@ def parts() -> tuple:
     return scene, freeze(scene, 4, 1), responses, rng.normal(size=scene.points.shape)
 
 
-def test_whitened_products_are_those_of_the_inverse_covariance(parts: tuple) -> None:
+@pytest.mark.parametrize("beside", [1.0, 40.0])
+def test_whitened_products_are_those_of_the_inverse_covariance(parts: tuple, beside: float) -> None:
+    """Of noise and places, also beside an error of the model of which a place is no larger part than it is."""
     scene, split, responses, tracks = parts
-    white = whitener(scene, split, SIGMA, responses)
+    white = whitener(scene, split, SIGMA, responses).beside(beside)
     seen = scene.visible[slice(*split.train)]
     frames, points = np.nonzero(seen)
     place = np.zeros((3 * len(frames), 3 * POINTS))
     for row, (frame, point) in enumerate(zip(frames, points, strict=True)):
         place[3 * row : 3 * row + 3, 3 * point : 3 * point + 3] = responses[frame + split.train[0], point]
-    covariance = SIGMA**2 * (np.eye(len(place)) + place @ place.T)
+    covariance = SIGMA**2 * (np.eye(len(place)) + place @ place.T / beside)
     error = (scene.points - tracks)[slice(*split.train)][seen].reshape(-1)
     change = tracks[slice(*split.train)][seen].reshape(-1)
     got = white.residual(tracks)
@@ -44,7 +46,8 @@ def test_whitened_products_are_those_of_the_inverse_covariance(parts: tuple) -> 
     assert white.change(tracks) @ got == pytest.approx(expected, rel=1e-9)
 
 
-def test_what_all_points_share_joins_the_covariance(parts: tuple) -> None:
+@pytest.mark.parametrize("beside", [1.0, 40.0])
+def test_what_all_points_share_joins_the_covariance(parts: tuple, beside: float) -> None:
     scene, split, _, tracks = parts
     rng = np.random.default_rng(2)
     shared = [rng.normal(scale=SIGMA, size=tracks.shape) for _ in range(2)]
@@ -52,9 +55,9 @@ def test_what_all_points_share_joins_the_covariance(parts: tuple) -> None:
     assert white.knowing([]) is white
     seen = scene.visible[slice(*split.train)]
     common = np.stack([change[slice(*split.train)][seen].reshape(-1) for change in shared], axis=1)
-    covariance = SIGMA**2 * np.eye(len(common)) + common @ common.T
+    covariance = SIGMA**2 * np.eye(len(common)) + common @ common.T / beside
     error = (scene.points - tracks)[slice(*split.train)][seen].reshape(-1)
-    got = white.knowing(shared).residual(tracks)
+    got = white.knowing(shared, beside).residual(tracks)
     assert got @ got == pytest.approx(error @ np.linalg.solve(covariance, error), rel=1e-9)
 
 

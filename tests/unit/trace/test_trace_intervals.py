@@ -10,11 +10,11 @@ import pytest
 from sagging_bar import BUDGET, sagging
 
 from physworld.effects.registry import effect
+from physworld.estimation.left_out import LeftOut
 from physworld.estimation.refit import Refit
 from physworld.estimation.unknowns import Unknown
 from physworld.trace.candidates import candidates
 from physworld.trace.intervals import Spread, spread_of
-from physworld.trace.left_out import LeftOut
 from physworld.twin.build import build_twin
 
 ROWS = 60
