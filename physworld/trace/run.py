@@ -158,7 +158,8 @@ class _Trace:
         self.scene, self.split = recordings.scene, recordings.split
         self.config, self.simulations = config, simulations
         # what a rod loses is an effect here
-        self.frames, self.twin = self.split.train[1], lossless(twin) if twin.lattice.dim == 1 else twin
+        self.frames, self.given = self.split.train[1], twin
+        self.twin = lossless(twin) if twin.lattice.dim == 1 else twin
         self.faults = "; ".join(known.words for known in faults if known)
         self.notes = [f"left out as faulty sightings: {self.faults}"] if self.faults else []
 
@@ -171,7 +172,8 @@ class _Trace:
             self._setting(ground, declared.fitted.twin, declared.fitted.unknowns),
             share=declared.scale / declared.unseen.scale,
         )
-        starts = Starts(setting, early_part(ground.bare, self.split), self._beginning())
+        lost = self.twin is not self.given
+        starts = Starts(setting, early_part(ground.bare, self.split), self._beginning() if lost else {})
         sizes = (config.confirmed, config.additions, config.effects_at_most)
         search = Search(setting, chosen, starts, *sizes, config.seed)
         self.clock.start()

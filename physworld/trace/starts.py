@@ -63,8 +63,8 @@ class Starts:
     Attributes:
         setting: what all hypotheses share.
         early: whitener of the first part of the training frames, by the noise alone, and their end.
-        calibrated: where the calibration ended, by name: of a rod beside its losses, without which the declared physics
-            comes to rest elsewhere.
+        calibrated: where the calibration ended, by name, of a rod, whose losses are effects here: without them the
+            declared physics comes to rest elsewhere. Of other bodies nothing.
     """
 
     setting: Setting
@@ -137,7 +137,9 @@ class Starts:
             starts += [
                 {**base.values, **kept, **{n: f * s for n, s in strengths.items()}} for f in (1.0, 0.3, 3.0)
             ]
-        # where the calibration ended, what is estimated elsewhere only has a direction
+        if not self.calibrated:
+            return starts
+        # there, what is estimated elsewhere only has a direction
         kept = {n: v for n, v in self.calibrated.items() if n in base.values}
         ranges = {u.name: max(abs(end) for end in u.bounds) for u in one.candidate.unknowns()}
         largest = max((abs(s) / ranges[n] for n, s in strengths.items()), default=1.0) or 1.0
