@@ -10,13 +10,10 @@ left-out error e of which 1 is noise, M numbers in B blocks tell its mean as wel
 
     n(e) = 1 / ((1 / e)^2 / M + (1 - 1 / e)^2 / B)
 
-independent numbers would (the variance of a mean square is the sum of its parts' variances). So what weighs one
-hypothesis against another counts n numbers instead of M: the likelihood is tempered (Miller and Dunson 2019, "Robust
-Bayesian inference via coarsening"), by a number that the data give. Between hypotheses it is n(e + 0.2), for that much
-error of the twin may hide in a noise whose variance is known to a fifth.
-
-How far data move the unknowns from their priors is another question, for an error that all points share leaves other
-directions of the data as they are. A fit counts n numbers or more: as few as predict left-out blocks as well as any.
+independent numbers would (the variance of a mean square is the sum of its parts' variances). So everything that weighs
+data against priors, or one hypothesis against another, counts n numbers instead of M: the likelihood is tempered
+(Miller and Dunson 2019, "Robust Bayesian inference via coarsening"), by a number that the data give. Between
+hypotheses it is n(e + 0.2), for that much error of the twin may hide in a noise whose variance is known to a fifth.
 """
 
 from __future__ import annotations
@@ -33,7 +30,6 @@ from physworld.estimation.refit import prior_rows
 from physworld.estimation.unknowns import Unknown, bounds_of
 
 NOISE_KNOWN = 0.2  # share to which the variance of the noise is known: its deviation to a tenth
-_FINER = 2.0  # ratio of the weights of priors that are compared
 _WEAKEST = 1e-9  # of the normal matrix's diagonal: keeps it invertible where data say nothing of an unknown
 
 
@@ -107,45 +103,14 @@ def left_out(linear: Linear, blocks: Sequence[Array], scale: float) -> LeftOut:
         blocks: rows of every block of frames, B arrays.
         scale: deviations of the noise that a sighting counts as, for the weight of the priors.
     """
-    return _predicted(linear, blocks, scale, scale)
-
-
-def best_scale(linear: Linear, blocks: Sequence[Array], scale: float, most: float) -> float:
-    """Deviations of the noise that a sighting counts as beside the priors: ``most``, or a half of it, a quarter and so
-    on down to 1: the largest under which left-out blocks are predicted as well as under any, to one standard error.
-
-    Args:
-        linear: about its optimum.
-        blocks: rows of every block of frames.
-        scale: under which that is the optimum.
-        most: what a sighting counts as between hypotheses.
-    """
-    steps = int(np.ceil(np.log(max(most, 1.0)) / np.log(_FINER)))
-    scales = [*(most / _FINER**k for k in range(steps)), 1.0]
-    found = [_predicted(linear, blocks, scale, other) for other in scales]
-    best = min(found, key=lambda one: one.mean)
-    return float(next(s for s, one in zip(scales, found, strict=True) if _as_good(one, best)))
-
-
-def _as_good(one: LeftOut, best: LeftOut) -> bool:
-    """Whether errors exceed the best ones by no more than the standard error of the difference over the blocks."""
-    more = one.errors - best.errors
-    return bool(np.average(more, weights=one.sizes) <= np.std(more) / np.sqrt(len(more)))
-
-
-def _predicted(linear: Linear, blocks: Sequence[Array], scale: float, other: float) -> LeftOut:
-    """Errors of every block, where a sighting counts as ``other``, about the optimum under ``scale``."""
-    residual, jacobian = linear.residual / other, linear.jacobian / other
+    residual, jacobian = linear.residual / scale, linear.jacobian / scale
     prior_residual, prior_slope = prior_rows(linear.unknowns, linear.theta)
     normals = [jacobian[rows].T @ jacobian[rows] for rows in blocks]
     gradients = [jacobian[rows].T @ residual[rows] for rows in blocks]
     count = len(linear.unknowns)
     normal = sum(normals, np.zeros((count, count))) + prior_slope.T @ prior_slope
-    pull = prior_slope.T @ prior_residual
-    gradient = sum(gradients, np.zeros(count)) + pull
-    # data and priors balance at an optimum; what a search has left of it is no fault of the block that is left out
-    free = unbound(linear)
-    gradient[free] = (1.0 - (scale / other) ** 2) * pull[free]
+    gradient = sum(gradients, np.zeros(count)) + prior_slope.T @ prior_residual
+    gradient[unbound(linear)] = 0.0  # what a search has left of it is no fault of the block that is left out
     weakest = np.diag(_WEAKEST * np.diag(normal) + 1e-30)
     errors = []
     for k, rows in enumerate(blocks):

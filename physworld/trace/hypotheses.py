@@ -17,7 +17,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.errors import SimulationError
-from physworld.estimation.left_out import LeftOut, Linear, best_scale, counted, left_out
+from physworld.estimation.left_out import LeftOut, Linear, counted, left_out
 from physworld.estimation.refit import Refit, prior_rows, refit
 from physworld.estimation.simulations import Job
 from physworld.estimation.unknowns import Unknown, at
@@ -41,14 +41,12 @@ class Hypothesis:
         fitted: the optimum; residual and Jacobian are whitened by ``white``.
         unseen: its errors on left-out blocks.
         white: by noise, solver, and the points' places as its own motion carries them.
-        scale: deviations of the noise that a sighting counts as beside the priors.
     """
 
     members: tuple[Candidate, ...]
     fitted: Refit
     unseen: LeftOut
     white: Whitener
-    scale: float
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -93,7 +91,6 @@ class Setting:
         iterations: of a fit.
         twin: of the declared physics.
         calibrated: unknowns that every hypothesis has.
-        share: of what a sighting counts as between hypotheses, what it counts as beside the priors, as a first guess.
     """
 
     simulations: JointSimulations
@@ -104,7 +101,6 @@ class Setting:
     iterations: int
     twin: Twin
     calibrated: Sequence[Unknown]
-    share: float = 1.0
 
     def assembled(
         self, members: Sequence[Candidate], values: Values, shapes: bool = True
@@ -126,8 +122,8 @@ class Setting:
         return twin, unknowns
 
     def counted(self, error: float) -> float:
-        """Deviations of the noise that a sighting counts as at a mean squared residual of ``error``, a first guess."""
-        return max(1.0, self.share * counted(error, sum(len(rows) for rows in self.blocks), len(self.blocks)))
+        """Deviations of the noise that a sighting counts as at a mean squared residual of ``error``."""
+        return counted(error, sum(len(rows) for rows in self.blocks), len(self.blocks))
 
     def best_of(
         self, members: Sequence[Candidate], places: Sequence[Values], white: Whitener
@@ -177,10 +173,10 @@ class Setting:
             slopes = own.over_from(white, scale * done.jacobian)
             plain = replace(done, residual=own.residual(done.tracks), jacobian=slopes)
             linear = Linear(plain.residual, plain.jacobian, plain.unknowns, plain.theta)
-            new = Hypothesis(tuple(members), plain, left_out(linear, self.blocks, scale), own, scale)
+            new = Hypothesis(tuple(members), plain, left_out(linear, self.blocks, scale), own)
             if found is None or new.left <= found.left:
                 found = new
-            following = best_scale(linear, self.blocks, scale, new.unseen.scale)
+            following = new.unseen.scale
             if number and max(scale, following) <= _SAME * min(scale, following):
                 break
             if float(np.sum(plain.residual**2)) > hopeless:

@@ -168,10 +168,7 @@ class _Trace:
         ground = self._ground()
         declared = self._declared(ground)
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
-        setting = replace(
-            self._setting(ground, declared.fitted.twin, declared.fitted.unknowns),
-            share=declared.scale / declared.unseen.scale,
-        )
+        setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
         lost = self.twin is not self.given
         starts = Starts(setting, early_part(ground.bare, self.split), self._beginning() if lost else {})
         sizes = (config.confirmed, config.additions, config.effects_at_most)

@@ -70,7 +70,7 @@ def _bounded(
     base: Hypothesis, jacobian: Array, unknowns: list[Unknown], start: Array, strengths: int
 ) -> Array:
     """Linear change of all unknowns (p,) within their bounds, the last ones strengths, by what a sighting counts."""
-    slope, residual = jacobian / base.scale, base.fitted.residual / base.scale
+    slope, residual = jacobian / base.unseen.scale, base.fitted.residual / base.unseen.scale
     prior_residual, prior_slope = prior_rows(unknowns, start)
     normal = slope.T @ slope + prior_slope.T @ prior_slope
     gradient = slope.T @ residual + prior_slope.T @ prior_residual

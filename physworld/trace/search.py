@@ -240,7 +240,7 @@ class Search:
 
     def _take_out(self, larger: Hypothesis) -> None:
         """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""
-        scale, white, declared = larger.scale, larger.white, self.hypotheses[()]
+        scale, white, declared = larger.unseen.scale, larger.white, self.hypotheses[()]
         for member in larger.members:
             rest = tuple(m for m in larger.members if m is not member)
             known = self.hypotheses.get(_names(rest))
@@ -266,7 +266,7 @@ class Search:
             if mirror is not None:
                 places.append({**best.values, **_mirrored(best, best.members[-1])})
             for place in places:
-                found = self.setting.fitted(best.members, place, scale=best.scale, white=best.white)
+                found = self.setting.fitted(best.members, place, scale=best.unseen.scale, white=best.white)
                 if found is not None and found.left < best.left:
                     best = found
         self._kept(best)

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from physworld.effects.registry import effect
-from physworld.estimation.left_out import LeftOut, Linear, best_scale, counted, independent, left_out
+from physworld.estimation.left_out import LeftOut, Linear, independent, left_out
 from physworld.estimation.unknowns import Unknown
 from physworld.trace.answer import decided
 from physworld.trace.candidates import Candidate
@@ -70,42 +70,6 @@ def test_sightings_are_worth_what_the_spread_of_their_mean_square_says(shared: f
     parts = np.mean(noise**2, axis=1) + np.mean((signs * common) ** 2, axis=1)
     worth = 2.0 * np.mean(parts) ** 2 / np.var(parts)
     assert independent(1.0 + shared, rows, blocks) == pytest.approx(worth, rel=0.1)
-
-
-def shared_error(truth: list[float], rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes and sightings of three numbers, with an error of 30 times the noise that all rows of a block share."""
-    rng = np.random.default_rng(5)
-    jacobian = rng.normal(size=(BLOCKS * rows, 3))
-    common = 30.0 * np.repeat(rng.normal(size=BLOCKS), rows)
-    return jacobian, jacobian @ np.array(truth) + common + rng.normal(size=BLOCKS * rows)
-
-
-def fitted_with_best_scale(truth: list[float], rows: int) -> tuple[float, float, Linear]:
-    """What a sighting counts as beside priors (0, 2) and between hypotheses, and the fit, after rounds in turn."""
-    jacobian, observed = shared_error(truth, rows)
-    blocks = [np.arange(k * rows, (k + 1) * rows) for k in range(BLOCKS)]
-    most = scale = counted(float(np.mean(observed**2)), BLOCKS * rows, BLOCKS)
-    for _ in range(4):
-        fitted = linear_fit(jacobian, observed, (-50.0, 50.0), scale)
-        most = left_out(fitted, blocks, scale).scale
-        scale = best_scale(fitted, blocks, scale, most)
-    return scale, most, fitted
-
-
-def test_numbers_far_from_their_priors_are_found_beside_an_error_that_all_rows_share() -> None:
-    """Counted by the blocks alone, priors would hold them back."""
-    truth = [20.0, -15.0, 8.0]
-    scale, most, fitted = fitted_with_best_scale(truth, rows=400)
-    assert scale < 0.5 * most
-    held_back = linear_fit(*shared_error(truth, 400), (-50.0, 50.0), most)
-    assert np.abs(fitted.theta - truth).max() < 0.5 * np.abs(held_back.theta - truth).max()
-
-
-def test_numbers_at_their_priors_are_left_to_them() -> None:
-    scale, most, fitted = fitted_with_best_scale([0.0, 0.0, 0.0], rows=12)
-    assert scale == pytest.approx(most)
-    alone = linear_fit(*shared_error([0.0, 0.0, 0.0], 12), (-50.0, 50.0), 1.0)
-    assert np.abs(fitted.theta).max() < 0.5 * np.abs(alone.theta).max()
 
 
 def unseen(*errors: float, rows: int = 100) -> LeftOut:
