@@ -61,7 +61,14 @@ from physworld_schemas.plan import PlanConfig, PlanLimits, PointGoal, ShapeGoal
 from physworld_schemas.rollout import Part, Start
 from physworld_schemas.scene import ImportGuess, PreviewMarker, SceneImport
 from physworld_schemas.trace import Figure, FoundEffect, TraceConfig
-from physworld_schemas.tracking import FilmPlane, FirstPicture, Gripper, TrackingOptions, TrackingPreview
+from physworld_schemas.tracking import (
+    FilmPlane,
+    FirstCloud,
+    FirstPicture,
+    Gripper,
+    TrackingOptions,
+    TrackingPreview,
+)
 from physworld_schemas.video import CameraView, VideoConfig, VideoReport, VideoScores
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -95,6 +102,7 @@ __all__ = [
     "FieldError",
     "Figure",
     "FilmPlane",
+    "FirstCloud",
     "FirstPicture",
     "Fit",
     "FitConfig",
