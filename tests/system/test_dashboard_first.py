@@ -6,6 +6,7 @@ import json
 import re
 import zipfile
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -81,8 +82,9 @@ def test_the_first_pictures_are_drawn_in_space_and_boxes_colour_what_lies_in_the
     fill(visit, "Box of what is held", left)
     held = (pixels >= left[:2]).all(axis=1) & (pixels < left[2:]).all(axis=1)
     assert inside(figure, "held") == held.sum() > 10
-    for scheme, width in (("dark", 360), ("light", 1280)):
-        visit.page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+    schemes: tuple[tuple[Literal["dark", "light"], int], ...] = (("dark", 360), ("light", 1280))
+    for scheme, width in schemes:
+        visit.page.emulate_media(color_scheme=scheme)
         visit.page.set_viewport_size({"width": width, "height": 900})
         assert violations(visit) == []
         assert visit.page.evaluate("document.documentElement.scrollWidth") <= width
