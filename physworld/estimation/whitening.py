@@ -3,9 +3,10 @@
 The covariance of measured minus predicted is sigma^2 (I + G G^T): sigma the tracking noise; G the response of a tracked
 point to its own place in the body, which frame 0 gives with the same noise (a rigid body shows it as a shift that turns
 with it). Where a scene declares a covariance for every point, all of this holds after its factor is divided out
-(:meth:`physworld.scene.Scene.weighed`). Beside a model's own error of (e - 1) sigma^2 a sighting it is sigma^2
-(e I + G G^T), whitened as I + G G^T / e (:meth:`Whitener.beside`). W with W^T W the inverse is applied to residuals and to sensitivities alike, so
-that ordinary least squares of whitened quantities is the generalised one. G acts point by point, so thin factors do.
+(:meth:`physworld.scene.Scene.weighed`). Beside a model's own error of (e - 1) sigma^2 in every sighting it is sigma^2
+(e I + G G^T), whitened as I + G G^T / e (:meth:`Whitener.beside`). W with W^T W the inverse is applied to residuals and
+to sensitivities alike, so that ordinary least squares of whitened quantities is the generalised one. G acts point by
+point, so thin factors do.
 
 A rope or a sheet that is declared undeformed lies along the line or in the plane of its first points. Their noise
 turns it as a whole: a rope of nine markers by about sigma / (2 L), and then it swings as under a tilted gravity. Turns
