@@ -1,9 +1,11 @@
 """The material of one recording on another of the same object.
 
 What belongs to the object is taken over as it is: law, drag, flow law, fields. What belongs to a recording is its own:
-start, grips, ground, colliders. Of a discrete rod that is also how it was rolled when it was gripped, which nobody
-sees: the angle of its first grip about its axis, and by how much the far grip is rolled beyond that. They turn the
-natural curvature k0 within the section and add to the natural twist t0,
+start, grips, ground, colliders. Of a solid that is also when somebody let go of it, and by how much a measured frame is
+out of level; both are found on the training frames of the new recording, where these ask for it. Of a discrete rod it
+is how it was rolled when it was gripped, which nobody sees: the angle of its first grip about its axis, and by how much
+the far grip is rolled beyond that. They turn the natural curvature k0 within the section and add to the natural twist
+t0,
 
     k0'(s) = R(alpha - psi s / L) k0(s)        t0' = t0 - psi / L
 
@@ -19,8 +21,13 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.calibrate.descents import Optimum
+from physworld.calibrate.global_stage import free_optional
+from physworld.calibrate.parameters import level, release
 from physworld.calibrate.rod_parameters import SHAPE, rod_parameters
 from physworld.calibrate.rod_search import RodSearch
+from physworld.calibrate.search import Search
+from physworld.effects.gravity_tilt import GravityTilt
 from physworld.engine.rods.chain import Chain
 from physworld.errors import SceneUnsupported
 from physworld.estimation.unknowns import at
@@ -31,6 +38,7 @@ from physworld.twin.twin import Twin
 
 _ROLLS, _FAR_ROLLS = 16, (0.0, -1.0, 1.0, -2.0, 2.0, -3.0, 3.0)
 _DESCENTS, _STEPS, _STEP_RAD = 3, 6, 0.02
+_RUNS = 100  # of a solid, for release and level
 _EARLY = 0.43  # of the training frames, for the scan
 _ROUNDS = 4  # descents, each with what the one before it leaves as the deviation of a residual
 
@@ -60,10 +68,24 @@ def carried_over(twin: Twin, scene: Scene, particle_budget: int = 2000) -> Twin:
         law=twin.law,
         air_drag_per_s=twin.air_drag_per_s,
         grip_softness=twin.grip_softness,
-        effects=twin.effects,
+        effects=tuple(known for known in twin.effects if known.name != GravityTilt.name),
         properties=twin.properties if same else None,
     )
-    return taken if twin.natural is None else _shaped_as_seen(_rolled_as_seen(twin, taken, scene), scene)
+    if twin.natural is not None:
+        return _shaped_as_seen(_rolled_as_seen(twin, taken, scene), scene)
+    return _set_up_as_seen(taken, scene)
+
+
+def _set_up_as_seen(own: Twin, scene: Scene) -> Twin:
+    """The body with the release and the level of the training frames, where these ask for them."""
+    search = Search(scene, own, _RUNS, None, None)
+    loose = [*release(own, scene.times[: search.end]), *level(scene, own)]
+    if not loose:
+        return own
+    nothing = np.zeros(0)
+    begun = Optimum(nothing, float(np.mean(search.residual([], nothing) ** 2)))
+    kept, found, _ = free_optional(search, [], begun, loose)
+    return search.at(kept, found.theta)
 
 
 def _shaped_as_seen(own: Twin, scene: Scene) -> Twin:

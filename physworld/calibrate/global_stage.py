@@ -48,6 +48,7 @@ from physworld.calibrate.parameters import (
     affordable,
     flow_law,
     hangs_taut,
+    level,
     parameters_of,
     relaxing,
     release,
@@ -94,7 +95,8 @@ class CalibrationConfig:
         particle_budget: about how many particles a solid gets.
         max_simulations: at most this many runs over the training frames.
         device: Warp device of the simulations.
-        damping: "auto" adds drag and internal friction where the data ask; "none" keeps the declared physics only.
+        damping: "auto" adds drag, internal friction and a frame out of level where the data ask; "none" keeps the
+            declared physics only.
         bending: "auto" frees how a sheet bends where the data ask; "declared" keeps what its thickness says.
         law: name of the elastic law (:mod:`physworld.materials.library`); None for the shape's usual one.
         formulation: "auto", "total_lagrangian" or "updated_lagrangian": see :mod:`physworld.engine.formulations`.
@@ -270,7 +272,7 @@ def searched_parameters(scene: Scene, twin: Twin, config: CalibrationConfig) -> 
     )
     found += release(twin, scene.times[: scene.train[1]])
     if config.damping == "auto":
-        found += relaxing(twin, scene.times[: scene.train[1]])
+        found += [*relaxing(twin, scene.times[: scene.train[1]]), *level(scene, twin)]
     return found if config.bending == "auto" else [p for p in found if p.stage != "shape"]
 
 
@@ -335,7 +337,7 @@ def free_optional(
         best = max(enough, key=lambda k: gains[hopeful[k].name])
         kept, optimum = [*kept, hopeful[best]], trials[best]
         candidates.remove(hopeful[best])
-        if gains[hopeful[best].name] > _RESTART_GAIN:
+        if gains[hopeful[best].name] > _RESTART_GAIN and kept[0].stage == "stiffness":
             optimum = _restarted(search, kept, optimum)
     return kept, optimum, rejected
 

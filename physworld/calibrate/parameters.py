@@ -10,8 +10,9 @@ value that nothing reaches. A *shape* of the bending energy is freed next, as a 
 what its declared thickness says, and how its two curvatures are coupled. The *fibres* of a transversely isotropic
 solid are freed together too, modulus and direction (:mod:`physworld.calibrate.fibres`); their prior is none. The others
 are *optional*: air drag, internal friction, Poisson's ratio, the friction of a ground that declares none, the
-share of a solid's stiffness that fades (:func:`relaxing`), and what weft and shear of a woven sheet have over its warp;
-each is freed only if the data ask for it, and else stays at its prior.
+share of a solid's stiffness that fades (:func:`relaxing`), by how much a measured frame is out of level
+(:func:`level`), and what weft and shear of a woven sheet have over its warp; each is freed only if the data ask for it,
+and else stays at its prior.
 
 Internal friction that is proportional to stiffness damps the lattice's fastest motions most, and an explicit step has
 to resolve that: beyond a point the stable time step is inversely proportional to it. A recording shows nothing of these
@@ -30,6 +31,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from physworld.arrays import Array
+from physworld.effects.gravity_tilt import GravityTilt
 from physworld.effects.viscoelastic_maxwell import ViscoelasticMaxwell
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.estimation.unknowns import LINEAR, LOG, Transform, Unknown
@@ -45,7 +47,7 @@ from physworld.materials.rod import RodLaw
 from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw
 from physworld.materials.solid import SolidLaw
 from physworld.materials.transversely_isotropic import TransverselyIsotropic
-from physworld.scene import Scene
+from physworld.scene import AS_MEASURED, Scene
 from physworld.twin.twin import Twin
 
 BENDING, STRETCHING = "bending_n_m2", "stretching_n"  # E I and E A of a rope
@@ -69,8 +71,13 @@ _FIBRES_GAIN = 0.1  # share of the training cost, of fibres
 _FRICTION_BOUNDS = (0.02, 3.0)
 RELAXING_SHARE = "relaxing_share"
 RELEASE_DELAY = "release_delay_s"
+TILTS = {"gravity_tilt_x_rad": "tilt_x_rad", "gravity_tilt_y_rad": "tilt_y_rad"}
+OF_RECORDING = frozenset({RELEASE_DELAY, *TILTS})
+"""Names of what belongs to a recording, and not to the object."""
 _LONGEST_RELEASE_S = 0.1  # of a hand that opens
 _RELAXING_GAIN = 0.1  # share of the training cost, of stiffness that fades
+_LARGEST_TILT_RAD = 0.1  # of a measured frame: markers some centimetres apart, known to a millimetre or two
+_TILT_GAIN = 0.1  # share of the training cost, of each of its two angles
 _MOST_BRANCHES = 5  # of one decade each
 _NEVER_PA = 1e12  # a yield stress that nothing reaches
 _SAND_RAD = 0.6  # friction angle of loose dry sand
@@ -189,6 +196,24 @@ def release(twin: Twin, times: Array) -> list[Parameter]:
     return [
         Parameter(RELEASE_DELAY, "s", -2 * frame, max(5 * frame, _LONGEST_RELEASE_S),
                   _delayed, transform=LINEAR, step=0.25 * frame, starts=(frame,), stage="optional")
+    ]  # fmt: skip
+
+
+def level(scene: Scene, twin: Twin) -> list[Parameter]:
+    """By how much a measured frame is out of level: gravity's direction is found by markers that err by a millimetre.
+
+    A scene that starts undeformed and at rest was not measured so, and its gravity is taken as declared.
+
+    Args:
+        scene: the recording.
+        twin: its twin.
+    """
+    if scene.initial_state != AS_MEASURED or twin.lattice.dim < 3 or GravityTilt.refuses(twin) is not None:
+        return []
+    return [
+        Parameter(name, "rad", -_LARGEST_TILT_RAD, _LARGEST_TILT_RAD, _tilted(angle), transform=LINEAR, step=0.01,
+                  starts=(0.02,), stage="optional", least_gain=_TILT_GAIN)
+        for name, angle in TILTS.items()
     ]  # fmt: skip
 
 
@@ -405,6 +430,14 @@ def _rubs(twin: Twin, friction: float) -> Twin:
 def _delayed(twin: Twin, delay_s: float) -> Twin:
     """Of several recordings some may show no release."""
     return twin if twin.release_s == 0.0 else twin.with_parameters(release_delay_s=delay_s)
+
+
+def _tilted(angle: str) -> Callable[[Twin, float], Twin]:
+    def apply(twin: Twin, tilt_rad: float) -> Twin:
+        now = next((known for known in twin.effects if isinstance(known, GravityTilt)), GravityTilt())
+        return twin.with_effect(replace(now, **{angle: tilt_rad}))
+
+    return apply
 
 
 def _sheet_modulus(thickness: float) -> Callable[[Twin, float], Twin]:

@@ -23,7 +23,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.calibrate.descents import Optimum, Place
 from physworld.calibrate.estimates import training_losses
-from physworld.calibrate.parameters import RELEASE_DELAY, Parameter
+from physworld.calibrate.parameters import OF_RECORDING, Parameter
 from physworld.calibrate.search import Progress, Search
 from physworld.errors import SceneUnsupported
 from physworld.estimation.journal import Journal
@@ -108,7 +108,7 @@ def of_one_object(twins: Sequence[Twin]) -> list[Twin]:
 
 
 def together(
-    each: Sequence[Sequence[Parameter]], own: Callable[[str], bool] = lambda name: name == RELEASE_DELAY
+    each: Sequence[Sequence[Parameter]], own: Callable[[str], bool] = OF_RECORDING.__contains__
 ) -> list[Parameter]:
     """The numbers of the object once, then of every recording those that belong to it.
 
