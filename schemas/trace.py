@@ -42,7 +42,11 @@ class TraceConfig(Request):
         examples=[8],
     )
     iterations: int = Field(
-        default=8, ge=1, le=50, description="Gauss-Newton steps of a refit.", examples=[5]
+        default=5,
+        ge=1,
+        le=50,
+        description="Gauss-Newton steps of a refit, and one more for every eight of its numbers.",
+        examples=[5],
     )
     resamples: int = Field(
         default=1000, ge=100, le=100_000, description="Bootstrap resamples of an interval.", examples=[1000]

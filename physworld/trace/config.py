@@ -22,7 +22,7 @@ class TraceConfig:
         shortest_block: frames.
         confirmed: effects that are fitted with the full simulator where little is left; else all are asked.
         additions: effects that are fitted on top of a set.
-        iterations: Gauss-Newton iterations of a fit.
+        iterations: Gauss-Newton iterations of a fit, and one more for every eight of its numbers.
         effects_at_most: effects in one answer.
         refinement: what the solver does not know of itself is asked on cells so many times smaller and larger.
         bootstraps: resamples of the intervals.
@@ -39,7 +39,7 @@ class TraceConfig:
     shortest_block: int = 3
     confirmed: int = 8
     additions: int = 2
-    iterations: int = 8
+    iterations: int = 5
     effects_at_most: int = 3
     refinement: float = 1.4
     bootstraps: int = 1000

@@ -30,6 +30,7 @@ Values = Mapping[str, float]
 """Places of unknowns in the scale of their search, by name."""
 _ROUNDS = 3  # fits in turn with an estimate of what a sighting counts
 _SAME = 1.5  # ratio of two such estimates that are one
+_NUMBERS_AN_ITERATION = 8  # a rod of twenty-four numbers does not settle in the iterations that three need
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Setting:
             tracks.
         blocks: rows of every block of frames.
         frames: from the first to before this one.
-        iterations: of a fit.
+        iterations: of a fit of few numbers.
         twin: of the declared physics.
         calibrated: unknowns that every hypothesis has.
     """
@@ -161,11 +162,12 @@ class Setting:
         places = [np.array([start.get(u.name, u.start) for u in unknowns]) for start in starts]
         found: Hypothesis | None = None
         known: Array | None = None
+        iterations = self.iterations + len(unknowns) // _NUMBERS_AN_ITERATION
         for number in range(_ROUNDS):
             limit = hopeless / scale**2
             scaled = ScaledWhitener(white, scale)
             done = refit(
-                self.simulations, scaled, twin, unknowns, self.frames, self.iterations, places, limit, known
+                self.simulations, scaled, twin, unknowns, self.frames, iterations, places, limit, known
             )
             if done is None:
                 return found
