@@ -18,13 +18,13 @@ from test_dashboard_accessible import violations
 pytestmark = pytest.mark.browser
 COLOUR = """at => { const { viewer } = window; viewer.render();
   const gl = viewer.view.renderer.getContext(); const pixel = new Uint8Array(4);
-  const [x, y] = viewer.seenAt(viewer.places[at]);
+  const [x, y] = viewer.pointer.seenAt(viewer.places[at]);
   const scale = gl.drawingBufferWidth / viewer.canvas.clientWidth;
   gl.readPixels(x * scale, gl.drawingBufferHeight - y * scale, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
   return [...pixel].slice(0, 3); }"""
 PLACE = """at => { const { viewer } = window; viewer.canvas.scrollIntoView({ block: "center" });
   const { left, top } = viewer.canvas.getBoundingClientRect();
-  const [x, y] = viewer.seenAt(viewer.places[at]); return [left + x, top + y]; }"""
+  const [x, y] = viewer.pointer.seenAt(viewer.places[at]); return [left + x, top + y]; }"""
 
 
 def packed(folder: Path, target: Path) -> Path:
@@ -93,7 +93,7 @@ def test_the_first_pictures_are_drawn_in_space_and_boxes_colour_what_lies_in_the
     # the arrow named z stands on the ground and points up in the picture
     foot, tip = visit.page.evaluate(
         "(() => { const { viewer } = window; const low = viewer.tip.clone().setZ(0);"
-        " return [viewer.seenAt(low), viewer.seenAt(viewer.tip)]; })()"
+        " return [viewer.pointer.seenAt(low), viewer.pointer.seenAt(viewer.tip)]; })()"
     )
     assert tip[1] < foot[1] - 50 and abs(tip[0] - foot[0]) < 2
     with visit.page.expect_response(re.compile(r"/trackings/preview$")):

@@ -18,10 +18,11 @@ from physworld_storage import resources
 pytestmark = pytest.mark.browser
 MOTION = marker_files.made(frames=60)
 PLACE = """name => { const { viewer } = window; const { left, top } = viewer.canvas.getBoundingClientRect();
-  const [x, y] = viewer.seenAt(viewer.markers.find((marker) => marker.name === name)); return [left + x, top + y]; }"""
+  const { place } = viewer.markers.find((marker) => marker.name === name);
+  const [x, y] = viewer.pointer.seenAt(place); return [left + x, top + y]; }"""
 COLOUR = """name => { const { viewer } = window; viewer.render();
   const gl = viewer.view.renderer.getContext(); const pixel = new Uint8Array(4);
-  const [x, y] = viewer.seenAt(viewer.markers.find((marker) => marker.name === name));
+  const [x, y] = viewer.pointer.seenAt(viewer.markers.find((marker) => marker.name === name).place);
   const scale = gl.drawingBufferWidth / viewer.canvas.clientWidth;
   gl.readPixels(x * scale, gl.drawingBufferHeight - y * scale, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
   return [...pixel].slice(0, 3); }"""

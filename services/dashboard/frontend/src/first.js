@@ -3,13 +3,13 @@
 
 import { Box3, BufferAttribute, BufferGeometry, Color, Points, SRGBColorSpace, Vector3 } from "three";
 import { colour, onSchemeChange } from "./palette.js";
+import { Pointer } from "./pointer.js";
 import { roundPoints, segments } from "./points.js";
 import { View } from "./view.js";
 
 const DIRECTION = [0.18, -1, 0.5]; // from the middle of what is seen to the view; a single camera looks along y
 const TRIMMED = 0.12; // of the points, the farthest at each end of each axis, are not what the view is laid around
 const NEAR_PX = 10; // of the pointer to a point that it means
-const CLICK_PX = 4; // that a click may move; more turns the view
 const SHARE = 0.018; // of the radius, the size of a point
 const ARM = 0.5; // of the radius, the length of the axis up
 const ROLES = { object: ["accent", "in the object's box"], patch: ["warn", "on the gripper's patch"], held: ["good", "held"] };
@@ -24,9 +24,11 @@ export class First {
     this.view = new View(this.canvas);
     this.boxes = {};
     this.view.orbit.addEventListener("change", () => this.render());
-    this.canvas.addEventListener("pointerdown", (event) => (this.pressed = [event.clientX, event.clientY]));
-    this.canvas.addEventListener("pointerup", (event) => this.click(event));
-    this.canvas.addEventListener("pointermove", (event) => this.name(this.nearest(event)));
+    this.pointer = new Pointer(this.canvas, this.view, {
+      nearest: (away) => this.nearest(away),
+      named: (at) => this.name(at),
+      clicked: (at) => this.picked(this.cloud.cameras[at], this.cloud.pixels[at]),
+    });
     new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
     onSchemeChange(() => this.paint());
   }
@@ -104,35 +106,21 @@ export class First {
     this.render();
   }
 
-  click(event) {
-    if (!this.pressed || Math.hypot(event.clientX - this.pressed[0], event.clientY - this.pressed[1]) > CLICK_PX) return;
-    const at = this.nearest(event);
-    if (at !== undefined) this.picked(this.cloud.cameras[at], this.cloud.pixels[at]);
-  }
-
   name(at) {
     const told = at === undefined ? "" : `${this.cloud.places_m[at].map((value) => value.toFixed(3)).join(", ")} m`;
     this.figure.querySelector("[data-named]").textContent = told;
   }
 
   /** Number of the point that the pointer means: the nearest to the eye of those below it; or undefined. */
-  nearest(event) {
-    const { left, top } = this.canvas.getBoundingClientRect();
+  nearest(away) {
     const eye = this.view.camera.position;
     let [found, least] = [undefined, Infinity];
     (this.places ?? []).forEach((place, i) => {
-      const [x, y] = this.seenAt(place);
-      const off = Math.hypot(x - (event.clientX - left), y - (event.clientY - top));
+      const off = away(place);
       const distance = place.distanceTo(eye) * (1 + (0.1 * off) / NEAR_PX);
       if (off < NEAR_PX && distance < least) [found, least] = [i, distance];
     });
     return found;
-  }
-
-  /** Where a place is drawn on the canvas [px]. */
-  seenAt(place) {
-    const { x, y } = place.clone().project(this.view.camera);
-    return [((x + 1) / 2) * this.canvas.clientWidth, ((1 - y) / 2) * this.canvas.clientHeight];
   }
 
   paint() {
@@ -150,7 +138,7 @@ export class First {
   render() {
     this.view.render();
     if (!this.tip) return;
-    const [x, y] = this.seenAt(this.tip);
+    const [x, y] = this.pointer.seenAt(this.tip);
     this.figure.querySelector("[data-up]").style.transform = `translate(${x}px, ${y}px) translate(-50%, -100%)`;
   }
 }

@@ -3,13 +3,13 @@
 
 import { Box3, Vector3 } from "three";
 import { onSchemeChange } from "./palette.js";
+import { Pointer } from "./pointer.js";
 import { Cloud } from "./points.js";
 import { View } from "./view.js";
 
 const DIRECTION = [0.62, -1, 0.36]; // from the middle of the markers to the camera
 const MARGIN = 1.16; // of what is seen, in sizes of what is there
 const NEAR_PX = 16; // of the pointer to a marker that it means
-const CLICK_PX = 4; // that a click may move; more turns the view
 const ARM_PX = 64; // of the frame's axes
 const KINDS = [["body", "measured", "body"], ["gripper", "controllers", "gripper"], ["", "particles", "left out"]];
 
@@ -38,20 +38,22 @@ export class Markers {
     this.buttons = [...figure.querySelectorAll("[data-axis]")];
     for (const button of this.buttons) button.addEventListener("click", () => changed({ up: button.dataset.axis }));
     this.view.orbit.addEventListener("change", () => this.render());
-    this.canvas.addEventListener("pointerdown", (event) => (this.pressed = [event.clientX, event.clientY]));
-    this.canvas.addEventListener("pointerup", (event) => this.click(event));
-    this.canvas.addEventListener("pointermove", (event) => this.name(this.nearest(event)));
+    this.pointer = new Pointer(this.canvas, this.view, {
+      nearest: (away) => this.nearest(away),
+      named: (marker) => this.name(marker),
+      clicked: (marker) => this.click(marker),
+    });
     new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
     onSchemeChange(() => this.paint());
   }
 
   /** Draw what a preview found. */
   draw({ markers, axes, guesses }) {
-    this.markers = markers;
+    this.markers = markers.map((marker) => ({ ...marker, place: new Vector3(...marker.place_m) }));
     this.axes = axes.map((axis) => new Vector3(...axis));
     const up = guesses.find((guess) => guess.option === "up").value;
     for (const button of this.buttons) button.setAttribute("aria-pressed", button.dataset.axis === up);
-    const box = new Box3().setFromPoints(markers.map((marker) => new Vector3(...marker.place_m)));
+    const box = new Box3().setFromPoints(this.markers.map(({ place }) => place));
     if (!this.box?.equals(box)) this.place(box);
     this.dress();
     this.figure.dataset.ready = "true";
@@ -88,10 +90,7 @@ export class Markers {
     this.render();
   }
 
-  click(event) {
-    if (!this.pressed || Math.hypot(event.clientX - this.pressed[0], event.clientY - this.pressed[1]) > CLICK_PX) return;
-    const marker = this.nearest(event);
-    if (!marker) return;
+  click(marker) {
     marker.roles = after(marker);
     this.dress();
     this.name(marker);
@@ -105,20 +104,9 @@ export class Markers {
   }
 
   /** The marker that the pointer means, or undefined. */
-  nearest(event) {
-    const { left, top } = this.canvas.getBoundingClientRect();
-    const away = (marker) => {
-      const [x, y] = this.seenAt(marker);
-      return Math.hypot(x - (event.clientX - left), y - (event.clientY - top));
-    };
-    const near = this.markers.map((marker) => [away(marker), marker]).filter(([distance]) => distance < NEAR_PX);
+  nearest(away) {
+    const near = this.markers.map((marker) => [away(marker.place), marker]).filter(([distance]) => distance < NEAR_PX);
     return near.sort(([one], [other]) => one - other)[0]?.[1];
-  }
-
-  /** Where a marker is drawn on the canvas [px]. */
-  seenAt(marker) {
-    const { x, y } = new Vector3(...marker.place_m).project(this.view.camera);
-    return [((x + 1) / 2) * this.canvas.clientWidth, ((1 - y) / 2) * this.canvas.clientHeight];
   }
 
   paint() {
