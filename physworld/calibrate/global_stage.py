@@ -80,6 +80,7 @@ from physworld.twin.twin import Twin
 _LEAST_SCREENED = (
     0.1  # share of the gain that it needs which a parameter must show to first order to be tried
 )
+_LEAST_PROPORTIONAL = 0.5  # the same of one that acts in proportion
 _RESTARTS = (0.25, 4.0)  # factors on the stiffness that is tried again once something else was freed
 _RESTART_GAIN = 0.5  # share of the cost that this must have removed
 _PROMISING = 4.0  # times the best cost: a restart that is worse after two steps is left
@@ -323,7 +324,7 @@ def free_optional(
     rejected: dict[str, float] = {}
     while candidates:
         screened = search.screen(kept, optimum, candidates)
-        hopeful = [c for c in candidates if screened[c.name] >= _LEAST_SCREENED * c.least_gain]
+        hopeful = [c for c in candidates if screened[c.name] >= _least_screened(c)]
         trials = search.solve_each(
             [Descent([*kept, c], np.append(optimum.theta, c.searched(c.starts[0])), 4) for c in hopeful]
         )
@@ -340,6 +341,11 @@ def free_optional(
         if gains[hopeful[best].name] > _RESTART_GAIN and kept[0].stage == "stiffness":
             optimum = _restarted(search, kept, optimum)
     return kept, optimum, rejected
+
+
+def _least_screened(parameter: Parameter) -> float:
+    share = _LEAST_PROPORTIONAL if parameter.proportional else _LEAST_SCREENED
+    return share * parameter.least_gain
 
 
 def _groups(kept: list[Parameter]) -> list[list[Parameter]]:

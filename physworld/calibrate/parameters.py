@@ -99,6 +99,8 @@ class Parameter(Unknown):
             are freed together, "optional" ones one by one, if the data ask for them.
         held: value of one that is not freed.
         least_gain: share of the training cost that freeing an optional one must remove.
+        proportional: what it does is proportional to it, either way, so that what it promises to first order is about
+            what it removes.
         read: its value in a twin, in its unit; None: it is among the twin's ``parameters`` or follows from them.
         recording: number of the recording that it belongs to, where several are fitted; None: it is the object's.
     """
@@ -109,6 +111,7 @@ class Parameter(Unknown):
     step: float = _LOG_STEP
     held: float = 0.0
     least_gain: float = _LEAST_GAIN
+    proportional: bool = False
     read: Callable[[Twin], float] | None = None
     recording: int | None = None
 
@@ -212,7 +215,7 @@ def level(scene: Scene, twin: Twin) -> list[Parameter]:
         return []
     return [
         Parameter(name, "rad", -_LARGEST_TILT_RAD, _LARGEST_TILT_RAD, _tilted(angle), transform=LINEAR, step=0.01,
-                  starts=(0.02,), stage="optional", least_gain=_TILT_GAIN)
+                  starts=(0.02,), stage="optional", least_gain=_TILT_GAIN, proportional=True)
         for name, angle in TILTS.items()
     ]  # fmt: skip
 

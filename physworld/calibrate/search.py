@@ -307,7 +307,8 @@ class Search:
                 effect = there - solution.residual
                 effect = effect - basis @ (basis.T @ effect)
                 along = float(effect @ left)
-                helps = candidate.low < candidate.held or along < 0.0  # drag and friction push one way only
+                either = candidate.held != 0.0 or candidate.proportional
+                helps = either or along < 0.0  # drag and friction push one way only
                 size = float(effect @ effect) * float(left @ left)
                 gains[candidate.name] = along**2 / size if helps and size > 0 else 0.0 * size
             return {"gains": gains}
