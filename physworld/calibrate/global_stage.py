@@ -330,6 +330,9 @@ def free_optional(
         )
         gains = dict(screened)
         gains.update({c.name: 1.0 - t.cost / optimum.cost for c, t in zip(hopeful, trials, strict=True)})
+        gains.update(
+            {c.name: 0.0 for c, t in zip(hopeful, trials, strict=True) if _at_a_bound(c, t.theta[-1])}
+        )
         # not a number: the budget ended
         enough = [k for k, c in enumerate(hopeful) if gains[c.name] > c.least_gain]
         if not enough:
@@ -338,7 +341,8 @@ def free_optional(
         best = max(enough, key=lambda k: gains[hopeful[k].name])
         kept, optimum = [*kept, hopeful[best]], trials[best]
         candidates.remove(hopeful[best])
-        if gains[hopeful[best].name] > _RESTART_GAIN and kept[0].stage == "stiffness":
+        restarts = kept[0].stage == "stiffness" and not hopeful[best].proportional
+        if restarts and gains[hopeful[best].name] > _RESTART_GAIN:
             optimum = _restarted(search, kept, optimum)
     return kept, optimum, rejected
 
@@ -346,6 +350,11 @@ def free_optional(
 def _least_screened(parameter: Parameter) -> float:
     share = _LEAST_PROPORTIONAL if parameter.proportional else _LEAST_SCREENED
     return share * parameter.least_gain
+
+
+def _at_a_bound(parameter: Parameter, value: float) -> bool:
+    """Whether one that acts in proportion went as far as it may: then it stands for something else."""
+    return parameter.proportional and not parameter.bounds[0] < value < parameter.bounds[1]
 
 
 def _groups(kept: list[Parameter]) -> list[list[Parameter]]:
