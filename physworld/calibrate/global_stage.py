@@ -297,8 +297,11 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
     )
     rejected.update(without)
     optional = [p for p in parameters if p.stage == "optional"]
-    kept, optimum, without = free_optional(search, kept, optimum, optional)
-    rejected.update(without)
+    # those that act in proportion last: with most of the cost gone, every other one would promise a share of the rest
+    for proportional in (False, True):
+        asked = [p for p in optional if p.proportional is proportional]
+        kept, optimum, without = free_optional(search, kept, optimum, asked)
+        rejected.update(without)
     for needless in _groups(kept):
         others = [k for k, p in enumerate(kept) if p not in needless]
         trial = search.solve([kept[k] for k in others], optimum.theta[others], 2)
