@@ -53,13 +53,14 @@ def test_pictures_become_scenes_by_sdk_and_command_line(tmp_path: Path) -> None:
                 kind="sheet", fps=30.0, up="-y", boxes={0: BOX}, points=40,
                 gripper=Gripper(patch=PATCH, held_px=HELD), body={"mass_kg": 0.05},
             )  # fmt: skip
-            seen: list[str] = []
-            job = client.trackings.create(folder, options)
-            job = client.jobs.wait(job, WITHIN_S, lambda at: seen.append(at.progress.message))
+            job = client.jobs.wait(client.trackings.create(folder, options), WITHIN_S)
+            told = [str(event.data) for event in client.jobs.events(job.id) if event.type == "progress"]
             scene = client.scenes.get(job.outputs[0].id)
             assert (scene.name, scene.kind, scene.frames, scene.controllers) == ("plate", "sheet", FRAMES, 8)
             assert {"scene.zip", "followed.png"} <= {item.name for item in scene.artifacts}
-            assert seen  # which of its stages a poll meets is a matter of the machine's load
+            assert any(stage in event for event in told for stage in ("reading", "tracking", "gripping")), (
+                told
+            )
 
             environment = {**os.environ, "PHYSWORLD_URL": state["api_url"], "PHYSWORLD_TOKEN": key}
             words = [
