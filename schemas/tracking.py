@@ -22,6 +22,9 @@ Line = tuple[Place, Place, Place, Place]
 """Column and row of two pixels."""
 Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 Corner = tuple[Length, Length, Length]
+Share = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
+Pose = tuple[Length, Length, Length, Share, Share, Share, Share]
+"""Place [m] and quaternion, scalar first."""
 FileName = Annotated[str, Field(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f\\]+$")]
 """Path of a file in the archive."""
 
@@ -53,7 +56,7 @@ class Gripper(Request):
     )
     log: FileName | None = Field(
         default=None,
-        description="A robot's log in the archive, in the scene's world: CSV with `t,x,y,z` and, if it turns, "
+        description="A robot's log in the archive: CSV with `t,x,y,z` and, if it turns, "
         "`qw,qx,qy,qz`; MCAP; or a parquet file of LeRobot with `info.json`, or the folder of its data set.",
         examples=["robot.csv"],
     )
@@ -79,6 +82,12 @@ class Gripper(Request):
         allow_inf_nan=False,
         description="Of the pictures' clock behind the log's.",
         json_schema_extra={"unit": "s"},
+    )
+    log_base: Pose | None = Field(
+        default=None,
+        description="Pose of the log's frame (the robot's base) in the cameras' world, from a hand-eye calibration: "
+        "x, y, z in metres and a quaternion, scalar first; null: the log is in the scene's world.",
+        examples=[[0.4, 0.0, -0.1, 1.0, 0.0, 0.0, 0.0]],
     )
     held_px: PixelBox | None = Field(
         default=None,

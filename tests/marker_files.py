@@ -380,33 +380,31 @@ def hdf5(motion: Motion, path: Path, **options: Any) -> bytes:
     return path.read_bytes()
 
 
-POSE_SCHEMA = """std_msgs/Header header
-geometry_msgs/Pose pose
-================================================================================
-MSG: std_msgs/Header
+RULE = f"{'=' * 80}\n"
+HEADER = f"""{RULE}MSG: std_msgs/Header
 builtin_interfaces/Time stamp
 string frame_id
-================================================================================
-MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation
-================================================================================
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Quaternion
+{RULE}MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+QUATERNION = f"""{RULE}MSG: geometry_msgs/Quaternion
 float64 x
 float64 y
 float64 z
 float64 w
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
 """
-CLOUD_SCHEMA = """std_msgs/Header header
+POSE_SCHEMA = f"""std_msgs/Header header
+geometry_msgs/Pose pose
+{RULE}MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+{RULE}MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+{QUATERNION}{HEADER}"""
+CLOUD_SCHEMA = f"""std_msgs/Header header
 uint32 height
 uint32 width
 sensor_msgs/PointField[] fields
@@ -415,20 +413,11 @@ uint32 point_step
 uint32 row_step
 uint8[] data
 bool is_dense
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: sensor_msgs/PointField
+{HEADER}{RULE}MSG: sensor_msgs/PointField
 string name
 uint32 offset
 uint8 datatype
 uint32 count
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
 """
 
 

@@ -8,46 +8,27 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import marker_files
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as parquet
+from marker_files import HEADER, POSE_SCHEMA, QUATERNION, RULE
 from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
 EPOCH_S = 1.7e9
-TRANSFORM = """\
-std_msgs/Header header
+TRANSFORM = f"""std_msgs/Header header
 string child_frame_id
 geometry_msgs/Transform transform
-================================================================================
-MSG: geometry_msgs/Transform
+{RULE}MSG: geometry_msgs/Transform
 geometry_msgs/Vector3 translation
 geometry_msgs/Quaternion rotation
-================================================================================
-MSG: geometry_msgs/Vector3
+{RULE}MSG: geometry_msgs/Vector3
 float64 x
 float64 y
 float64 z
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-TF = f"""\
-geometry_msgs/TransformStamped[] transforms
-================================================================================
-MSG: geometry_msgs/TransformStamped
+{QUATERNION}{HEADER}"""
+TF = f"""geometry_msgs/TransformStamped[] transforms
+{RULE}MSG: geometry_msgs/TransformStamped
 {TRANSFORM}"""
 EULER = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 
@@ -101,7 +82,7 @@ def mcap_pose(times: Array, places: Array, turns: Array) -> bytes:
 
     stream = io.BytesIO()
     writer = Writer(stream)
-    schema = writer.register_msgdef("geometry_msgs/msg/PoseStamped", marker_files.POSE_SCHEMA)
+    schema = writer.register_msgdef("geometry_msgs/msg/PoseStamped", POSE_SCHEMA)
     for time, place, turn in zip(times, places, turns, strict=True):
         pose = {"position": vector(place), "orientation": quaternion(turn)}
         message = {"header": {"stamp": stamp(time), "frame_id": "base"}, "pose": pose}

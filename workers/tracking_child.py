@@ -146,6 +146,7 @@ def _grip(gripper: Gripper, top: Path) -> GripFrom:
         log_pose=gripper.log_pose,
         log_episode=gripper.log_episode,
         log_delay_s=gripper.log_delay_s,
+        log_base=gripper.log_base,
         held_px=box(gripper.held_px),
         held_m=gripper.held_m,
     )

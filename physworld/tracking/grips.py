@@ -6,6 +6,7 @@ controllers. Markers are in :mod:`physworld.tracking.markers` and :mod:`physworl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +18,9 @@ from physworld.errors import TrackingFailed
 from physworld.tracking.depth import on_plane, plane_in
 from physworld.tracking.rigid import RigidPath, joined, without_noise
 from physworld.tracking.view import View, from_opencv, to_opencv
+
+UNIT_WITHIN = 1e-2
+"""How far from 1 the length of a quaternion may be."""
 
 
 def colour_middles(
@@ -95,14 +99,49 @@ def translated(middles: Array) -> RigidPath:
     return without_noise(None, middles, seen, middles[seen][:1], 0.0)
 
 
-def logged(log_times: Array, places: Array, quaternions_wxyz: Array | None, times: Array) -> RigidPath:
+@dataclass(frozen=True)
+class LogFrame:
+    """The frame of a log in the scene's world: ``x_scene = turn · x_log + place``, with place (3,) [m]."""
+
+    turn: Rotation
+    place: Array
+
+    @classmethod
+    def of_base(cls, pose: Sequence[float], turned: Array | None = None) -> LogFrame:
+        """The frame of a robot's base.
+
+        Args:
+            pose: of the base in the cameras' world: x, y, z [m] and a quaternion, scalar first, of length 1.
+            turned: the cameras' world in the scene's, 4 × 4; None: they are one.
+
+        Raises:
+            TrackingFailed: the quaternion's length is not 1 within a hundredth.
+        """
+        given = np.asarray(pose, dtype=np.float64)
+        length = float(np.linalg.norm(given[3:]))
+        if not abs(length - 1.0) <= UNIT_WITHIN:
+            raise TrackingFailed(f"the quaternion of the robot's base has length {length:.4g}, not 1")
+        turn, place = Rotation.from_quat(given[[4, 5, 6, 3]]), given[:3]
+        if turned is None:
+            return cls(turn, place)
+        return cls(Rotation.from_matrix(turned[:3, :3]) * turn, turned[:3, :3] @ place + turned[:3, 3])
+
+
+def logged(
+    log_times: Array,
+    places: Array,
+    quaternions_wxyz: Array | None,
+    times: Array,
+    frame: LogFrame | None = None,
+) -> RigidPath:
     """The path of a robot's log at the frames' times.
 
     Args:
         log_times: [s], on the clock of the frames, (L,) increasing.
-        places: of the tool in the scene's world [m], (L, 3).
+        places: of the tool in the log's frame [m], (L, 3).
         quaternions_wxyz: its orientation, (L, 4), or None: it does not turn.
         times: of the frames [s], (T,).
+        frame: of the log in the scene's world; None: they are one.
 
     Raises:
         TrackingFailed: the log does not cover the recording.
@@ -113,9 +152,13 @@ def logged(log_times: Array, places: Array, quaternions_wxyz: Array | None, time
             f"{times[0]:.3f} to {times[-1]:.3f} s"
         )
     there = np.stack([np.interp(times, log_times, places[:, axis]) for axis in range(3)], axis=1)
+    if frame is not None:
+        there = frame.turn.apply(there) + frame.place
     turns = np.zeros((len(times), 3))
     if quaternions_wxyz is not None:
         rotations = Rotation.from_quat(quaternions_wxyz[:, [1, 2, 3, 0]])
         now = Slerp(log_times, rotations)(np.clip(times, log_times[0], log_times[-1]))
-        turns = (now * now[0].inv()).as_rotvec()
+        turns = (now * now[0].inv()).as_rotvec()  # about the log's axes
+        if frame is not None:
+            turns = frame.turn.apply(turns)
     return RigidPath(turns, there, np.ones(len(times), dtype=bool), there[:1], 0.0)

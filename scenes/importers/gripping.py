@@ -11,7 +11,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
-from physworld.tracking.grips import colour_middles, logged, translated
+from physworld.tracking.grips import LogFrame, colour_middles, logged, translated
 from physworld.tracking.poses import marker_path
 from physworld.tracking.recording import Followed, patch_points
 from physworld.tracking.rigid import RigidPath, rigid_path
@@ -34,10 +34,12 @@ class GripFrom:
         dictionary: of the marker.
         patch: a box on it in the first camera's first picture: its texture is followed.
         colour: column and row of a pixel of its colour there; such a gripper does not turn.
-        log: of a robot in the scene's world, SI units: CSV with a head (t, x, y, z and, if it turns, qw, qx, qy, qz),
-            MCAP, or a file or folder of LeRobot.
+        log: of a robot, SI units: CSV with a head (t, x, y, z and, if it turns, qw, qx, qy, qz), MCAP, or a file or
+            folder of LeRobot.
         log_pose, log_episode: which pose and episode of it, where it has several.
         log_delay_s: of the pictures' clock behind the log's.
+        log_base: pose of the log's frame (the robot's base) in the cameras' world, as a hand-eye calibration gives it:
+            x, y, z [m] and a quaternion, scalar first; None: the log is in the scene's world.
         held_px: a box around what it holds of the object, in the same picture.
         held_m: instead, the corners of a box of undeformed material [m], (2, 3), in the scene's world.
     """
@@ -50,11 +52,18 @@ class GripFrom:
     log_pose: str | None = None
     log_episode: int | None = None
     log_delay_s: float = 0.0
+    log_base: tuple[float, ...] | None = None
     held_px: Box | None = None
     held_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 
 
-def gripper_path(views: list[View], grip: GripFrom, times: Array, warnings: list[str]) -> RigidPath:
+def gripper_path(
+    views: list[View],
+    grip: GripFrom,
+    times: Array,
+    warnings: list[str],
+    turned: Array | None = None,
+) -> RigidPath:
     """The gripper's motion from what tells it, seen by all cameras.
 
     Args:
@@ -62,6 +71,7 @@ def gripper_path(views: list[View], grip: GripFrom, times: Array, warnings: list
         grip: what tells it.
         times: of the frames [s], (T,).
         warnings: what a log does not say is added.
+        turned: the cameras' world in the scene's, 4 × 4; None: they are one.
 
     Raises:
         TrackingFailed: it is not seen, or the log does not cover the recording.
@@ -81,7 +91,8 @@ def gripper_path(views: list[View], grip: GripFrom, times: Array, warnings: list
             warnings.append(
                 f"{grip.log.name} ({log.told}) says no rotation: the gripper is taken not to turn"
             )
-        return logged(log.times - grip.log_delay_s, log.places, log.turns, times)
+        frame = None if grip.log_base is None else LogFrame.of_base(grip.log_base, turned)
+        return logged(log.times - grip.log_delay_s, log.places, log.turns, times, frame)
     raise TrackingFailed("what tells the gripper's motion? A marker, a patch, a colour or a log")
 
 

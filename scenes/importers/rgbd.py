@@ -103,8 +103,10 @@ def read_folder(
             )
     tracks = read_tracks(folder, given.tracks, recording, warnings)
     try:
+        declared_camera = recording.views[0].camera
         recording, ground, up = upright(recording, given.up, given.boxes, warnings)
         views = recording.views
+        turned = np.linalg.inv(views[0].camera.world_to_camera) @ declared_camera.world_to_camera
         boxes = [given.boxes.get(number) for number in range(len(views))]
         made = [mask_file(given.masks.get(number), view.camera) for number, view in enumerate(views)]
         masks = masks_of(views, boxes, made, None if ground is None else ground.height)
@@ -119,7 +121,7 @@ def read_folder(
             warnings.append(f"the folder says no rate: {fps:g} frames per second are assumed")
         times = np.arange(views[0].frames) / fps
         told(0, 1, "gripping")
-        path = None if given.grip is None else gripper_path(views, given.grip, times, warnings)
+        path = None if given.grip is None else gripper_path(views, given.grip, times, warnings, turned)
     except TrackingFailed as error:
         raise refused(folder.name, str(error)) from error
     told(0, 1, "scene")

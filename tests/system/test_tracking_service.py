@@ -47,8 +47,13 @@ def test_pictures_become_scenes_by_sdk_and_command_line(tmp_path: Path) -> None:
         state = service.state()
         key = Path(state["api_key_file"]).read_text().strip()
         with Client(state["api_url"], key, timeout=90.0) as client:
-            (camera,) = client.trackings.preview(folder).cameras
+            seen = client.trackings.preview(folder)
+            (camera,) = seen.cameras
             assert (camera.frames, camera.media_type) == (FRAMES, "image/png")
+            near = client.trackings.preview(folder, TrackingOptions(depth_scale=2000.0))
+            assert seen.cloud is not None and near.cloud is not None
+            halved = 0.5 * np.asarray(seen.cloud.places_m)
+            assert len(halved) > 100 and np.allclose(np.asarray(near.cloud.places_m), halved, atol=2e-3)
             options = TrackingOptions(
                 kind="sheet", fps=30.0, up="-y", boxes={0: BOX}, points=40,
                 gripper=Gripper(patch=PATCH, held_px=HELD), body={"mass_kg": 0.05},

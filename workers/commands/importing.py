@@ -121,6 +121,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--log-episode", type=int, default=None, help="which episode of LeRobot")
     parser.add_argument("--log-delay", type=float, default=0.0, help="pictures' clock behind the log's [s]")
+    parser.add_argument(
+        "--log-base", default=None, help="robot's base in the cameras' world: X,Y,Z,QW,QX,QY,QZ"
+    )
     parser.add_argument("--held", default=None, help="box around what it holds: LEFT,TOP,RIGHT,BOTTOM")
     parser.add_argument("--held-m", default=None, help="instead, in the world [m]: X,Y,Z,X,Y,Z")
     parser.add_argument("--depth-scale", type=float, default=None, help="depth values a metre")
@@ -292,6 +295,7 @@ def _picture_options(given: argparse.Namespace) -> PictureOptions:
             log_pose=given.log_pose,
             log_episode=given.log_episode,
             log_delay_s=given.log_delay,
+            log_base=None if given.log_base is None else tuple(numbers("--log-base", given.log_base, 7)),
             held_px=_box("--held", given.held),
             held_m=None if metres is None else ((metres[0], metres[1], metres[2]), (metres[3], metres[4], metres[5])),
         )  # fmt: skip

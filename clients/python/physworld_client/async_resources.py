@@ -122,10 +122,14 @@ class AsyncTrackings(AsyncResource):
             call = Call("POST", route("trackings"), Job, upload=sent, form=_form(options))
             return await self._client.send(call)
 
-    async def preview(self, path: str | Path) -> TrackingPreview:
-        """The first picture of each camera, in whose pixels the options speak. Nothing is stored."""
+    async def preview(self, path: str | Path, options: TrackingOptions | None = None) -> TrackingPreview:
+        """The first picture of each camera, in whose pixels the options speak, and its cloud in the scene's world.
+        Nothing is stored; of the options the boxes, ``up`` and ``depth_scale`` bear on the cloud.
+        """
         with open_pictures(path) as upload, self._client.bars.sending(upload) as sent:
-            call = Call("POST", route("trackings", "preview"), TrackingPreview, upload=sent)
+            call = Call(
+                "POST", route("trackings", "preview"), TrackingPreview, upload=sent, form=_form(options)
+            )
             return await self._client.send(call)
 
 

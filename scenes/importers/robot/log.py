@@ -1,7 +1,7 @@
 """A robot's log of any form as poses of its end effector over time.
 
 ``read_log`` tells the form by the file: a folder with ``meta/info.json`` and parquet are LeRobot's, MCAP begins with
-its magic bytes, all else is CSV with a head. Places are in the scene's world [m]. The clock of CSV and LeRobot is the
+its magic bytes, all else is CSV with a head. Places are in the log's frame [m]. The clock of CSV and LeRobot is the
 file's; that of MCAP counts from the first message of the pose, whose stamps are dates.
 """
 
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.tracking.grips import UNIT_WITHIN
 from physworld_scenes.errors import refused
 from physworld_scenes.importers.library import parsed_file
 from physworld_scenes.importers.robot.frames import Track, chained
@@ -25,14 +26,12 @@ from physworld_scenes.importers.tables.table import shortened
 MOST_LOG_BYTES = 64 << 20
 """Of CSV."""
 FARTHEST_M = 100.0
-UNIT_WITHIN = 1e-2
-"""How far from 1 the length of a quaternion may be."""
 SHOWN = 12
 
 
 @dataclass(frozen=True)
 class RobotLog:
-    """Poses of an end effector in the scene's world.
+    """Poses of an end effector in the frame of the log: the scene's world, or a robot's base.
 
     Attributes:
         times: on the log's clock [s], (L,) increasing.

@@ -16,6 +16,7 @@ from tracking_pictured import BOTTOM, FRAMES, LEFT, RIGHT, TOP, write
 from physworld_scenes.bundle import read_bundle
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import library
+from physworld_scenes.importers.axes import ROTATION_FROM_UP
 from physworld_scenes.importers.robot.log import RobotLog, read_log
 from physworld_workers.commands import importing
 
@@ -292,15 +293,16 @@ def test_options_of_another_form_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["mcap", "lerobot"])
+@pytest.mark.parametrize("form", ["mcap", "lerobot", "base"])
 def test_the_command_moves_the_gripper_as_the_log_says(
     tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The pictures begin 0.1 s after the log; a log that ends before them is refused with both spans."""
+    """The pictures begin 0.1 s after the log; a log that ends before them is refused with both spans. A log in the
+    frame of a robot's base is carried to the scene's world, over the cameras' world."""
     monkeypatch.setattr(library, "_limited_here", False)
     write(tmp_path / "plate")
     source = tmp_path / "take.mcap"
-    if form == "mcap":
+    if form != "lerobot":
         source.write_bytes(logs.mcap_pose(TIMES, PLACES, TURNS))
     else:
         source = data_set(tmp_path / "set")
@@ -308,16 +310,26 @@ def test_the_command_moves_the_gripper_as_the_log_says(
     arguments = [str(tmp_path / "plate"), f"--out={tmp_path / 'scene'}", f"--box={box}", "--kind=sheet", "--fps=30",
                  "--points=40", "--up=-y", f"--log={source}", "--log-delay=0.1",
                  f"--held={LEFT},{TOP},{LEFT + 15},{BOTTOM}"]  # fmt: skip
-    arguments += [] if form == "mcap" else ["--log-episode=1"]
+    arguments += ["--log-episode=1"] if form == "lerobot" else []
+    base, place = Rotation.identity(), np.zeros(3)
+    if form == "base":
+        base, place = Rotation.from_euler("xyz", [0.3, -0.2, 0.9]), np.array([0.1, -0.2, 0.4])
+        given = ",".join(f"{number:.17g}" for number in (*place, *base.as_quat()[[3, 0, 1, 2]]))
+        arguments += [f"--log-base={given}"]
+        up = Rotation.from_matrix(ROTATION_FROM_UP["-y"])
+        base, place = up * base, up.apply(place)
     assert importing.main(arguments) == 0
     scene = read_bundle(tmp_path / "scene")
     places, turns = logs.path_of(0.1 + np.arange(FRAMES) / 30.0)
-    rotation = Rotation.from_quat(turns[:, [1, 2, 3, 0]])
+    places, rotation = base.apply(places) + place, base * Rotation.from_quat(turns[:, [1, 2, 3, 0]])
     first = rotation[0].inv().apply(scene.controllers[0] - places[0])
     wanted = np.stack([r.apply(first) + place for r, place in zip(rotation, places, strict=True)])
     assert (
         np.abs(scene.controllers - wanted).max() < 1e-4
     )  # between two poses of the log the path is straight
+    if form == "base":
+        assert importing.main([*arguments, "--log-base=0,0,0,1,1,0,0"]) == 2
+        assert "the robot's base has length 1.414, not 1" in capsys.readouterr().err
     assert importing.main([*arguments, "--log-delay=1.0"]) == 2
     assert (
         "the log runs from -1.000 to 0.180 s, the recording from 0.000 to 0.367 s" in capsys.readouterr().err

@@ -67,6 +67,9 @@ def import_recording(
     ] = None,
     log_episode: Annotated[int | None, typer.Option(min=0, help="Of a log of LeRobot.")] = None,
     log_delay: Annotated[float | None, typer.Option(help="Pictures' clock behind the log's [s].")] = None,
+    log_base: Annotated[
+        str | None, typer.Option(help="The robot's base in the cameras' world: X,Y,Z,QW,QX,QY,QZ.")
+    ] = None,
     held: Annotated[str | None, typer.Option(help="Box around what is held: LEFT,TOP,RIGHT,BOTTOM.")] = None,
     held_m: Annotated[str | None, typer.Option(help="Instead, in the world [m]: X,Y,Z,X,Y,Z.")] = None,
     board: Annotated[
@@ -129,6 +132,7 @@ def import_recording(
         "--log-pose": log_pose,
         "--log-episode": log_episode,
         "--log-delay": log_delay,
+        "--log-base": log_base,
         "--held": held,
         "--held-m": held_m,
         "--board": board,

@@ -171,6 +171,8 @@ def _gripper(
     ):
         if given[option] is not None:
             told[key] = given[option]
+    if given["--log-base"] is not None:
+        told["log_base"] = _numbers("--log-base", given["--log-base"], 7)
     if given["--held-m"] is not None:
         corners = _numbers("--held-m", given["--held-m"], 6)
         told["held_m"] = [corners[:3], corners[3:]]

@@ -218,6 +218,8 @@ function optionsOf() {
       options.gripper.log = logFiles()[0]?.name ?? null;
       if (pose) options.gripper.log_pose = pose;
       if (!Number.isNaN(episode)) options.gripper.log_episode = episode;
+      const base = form.querySelector("[data-log-base]").value.trim();
+      if (base) options.gripper.log_base = base.split(/[\s,]+/).map(Number);
     }
     if (boxes.held[0]) options.gripper.held_px = boxes.held[0];
   }
