@@ -2,9 +2,9 @@
 
 The beam is MuJoCo's flex of ``scripts/make_sample_scene.py``, the bar the same of finite elements whose modulus is
 that of the material (``benchmarks.peers.finite_elements``), in a vacuum or in air, or soft in its middle, the rope
-the chain of ``scripts/make_sample_rope.py``, the cloth MuJoCo's flex of ``benchmarks.peers.flex_cloths``. A gripper of
-boxes holds them, covers what it holds, and carries an ArUco marker; a stick goes by between object and camera in the
-second second.
+the chain of ``scripts/make_sample_rope.py``, the cloth MuJoCo's flex of ``benchmarks.peers.flex_cloths`` or, clamped,
+those elements. A gripper of boxes holds them, covers what it holds, and carries an ArUco marker; a stick goes by
+between object and camera in the second second.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ FPS, FRAMES = 30.0, 90
 CONVERGED_PA, BAR_ELEMENTS, DRAG_PER_S = 2.85e5, (8, 2, 2), 1.0
 SOFT_LOG, SOFT_WIDTH = -1.2, 0.18
 """Of the uneven bar: logarithm of its modulus in the middle over the ends', deviation of the dip over its length."""
+CLOTH_SIZE_M, CLOTH_THICK_M, CLOTH_DENSITY_KG_M3, CLOTH_PA = (0.25, 0.27), 0.0045, 370.0, 2e5
+CLAMPED_CELLS, CLAMPED_M, CLOTH_POISSON = (12, 18), 0.03, 0.3
 MARKER_SIDE_M = 0.05
 """Of the marker itself; the plate that it is printed on is a fifth wider on every side."""
 MARKER_ID = 7
@@ -209,48 +211,98 @@ def rope(frames: int = FRAMES, drag_per_s: float = 0.0) -> Play:
 
 
 def cloth(frames: int = FRAMES) -> Play:
-    """A cloth that hangs from a bar along its upper edge and is swung to and from the camera."""
+    """A cloth that hangs from a bar along its upper edge and is swung to and from the camera.
+
+    Its triangles are held by one row of vertices, about which it turns as on a hinge.
+    """
     from benchmarks.peers.finite_elements import Acting
     from benchmarks.peers.flex_cloths import Mesh
 
-    width, height, thickness, density, young = 0.25, 0.27, 0.0045, 370.0, 2e5
-    mesh = Mesh((width, height), (20, 18), young_pa=young, thickness_m=thickness, density_kg_m3=density,
-                steps_per_frame=460)  # fmt: skip
+    mesh = Mesh(
+        CLOTH_SIZE_M, (20, 18), young_pa=CLOTH_PA, thickness_m=CLOTH_THICK_M,
+        density_kg_m3=CLOTH_DENSITY_KG_M3, steps_per_frame=460,
+    )  # fmt: skip
     rest = mesh.vertices()
     held = np.flatnonzero(rest[:, 2] >= rest[:, 2].max() - 1e-6)
-    centre = rest[held].mean(axis=0)
-
-    def pose(t: float) -> tuple[Array, Array]:
-        gain = 1.0 - np.exp(-((t / 0.4) ** 2))
-        shift = gain * np.array([0.04 * np.sin(2.3 * t), 0.05 * np.sin(4.0 * t), 0.02 * np.sin(3.1 * t)])
-        angle = gain * 0.3 * np.sin(2.0 * t)
-        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
-        return turn, shift
-
     positions = mesh.record(
-        Acting(), [(held, pose)], (rest[:, [0, 2]] - rest[:, [0, 2]].min(axis=0)) / [width, height],
+        Acting(), [(held, _swing)], (rest[:, [0, 2]] - rest[:, [0, 2]].min(axis=0)) / CLOTH_SIZE_M,
         np.arange(frames) / FPS,
     )  # fmt: skip
+    return _hung(mesh.triangles(), positions, 1e-3, 8e-3, {"youngs_modulus_pa": CLOTH_PA})
+
+
+def clamped_cloth(frames: int = FRAMES, cells: tuple[int, int] = CLAMPED_CELLS) -> Play:
+    """The same cloth and motion of quadratic finite elements: a plate, whose upper row of elements the bar holds.
+
+    Args:
+        frames: T.
+        cells: elements across and up.
+    """
+    from benchmarks.peers.finite_elements import Acting, Elements, record
+
+    width, height = CLOTH_SIZE_M
+    size = np.array([width, CLOTH_THICK_M, height])
+    elements = Elements(
+        (cells[0], 1, cells[1]), lambda unit: unit * size, CLOTH_PA, CLOTH_POISSON, CLOTH_DENSITY_KG_M3
+    )
+    held = np.flatnonzero(elements.nodes[:, 2] >= height - CLAMPED_M - 1e-6)
+    path = record(elements, Acting(), [(held, _swing)], np.arange(frames) / FPS)
+    across, up = np.meshgrid(np.linspace(1e-6, 1 - 1e-6, 51), np.linspace(1e-6, 1 - 1e-6, 55))
+    nodes, weights = elements.weights(
+        np.stack([across.ravel(), np.full(across.size, 0.5), up.ravel()], axis=1)
+    )
+    positions = np.einsum("pk,tpki->tpi", weights, path[:, nodes])
+    number = np.arange(across.size).reshape(across.shape)
+    a, b, c, d = (
+        part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1])
+    )
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    truth = {"youngs_modulus_pa": CLOTH_PA, "poisson": CLOTH_POISSON}
+    return _hung(triangles, positions, CLAMPED_M, CLAMPED_M, truth)
+
+
+def _swing(t: float) -> tuple[Array, Array]:
+    gain = 1.0 - np.exp(-((t / 0.4) ** 2))
+    shift = gain * np.array([0.04 * np.sin(2.3 * t), 0.05 * np.sin(4.0 * t), 0.02 * np.sin(3.1 * t)])
+    angle = gain * 0.3 * np.sin(2.0 * t)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    return turn, shift
+
+
+def _hung(triangles: Array, positions: Array, held_m: float, jaws_m: float, truth: dict[str, Any]) -> Play:
+    """A cloth that hangs from a bar, at first undeformed in a plane of x and z.
+
+    Args:
+        triangles: (F, 3).
+        positions: (T, V, 3) [m].
+        held_m: how much of its upper edge the bar holds.
+        jaws_m: how far the bar's jaws reach over it.
+        truth: what nobody tells the tracker.
+    """
+    rest = positions[0]
     low, high = rest.min(axis=0), rest.max(axis=0)
-    top = float(high[2])
+    centre = np.array([0.5 * (low[0] + high[0]), rest[:, 1].mean(), high[2]])
     jaws = [
-        box([low[0] - 0.01, centre[1] - 0.012, top - 0.008], [high[0] + 0.01, centre[1] + 0.012, top + 0.01])
+        box(
+            [low[0] - 0.01, centre[1] - 0.012, high[2] - jaws_m],
+            [high[0] + 0.01, centre[1] + 0.012, high[2] + 0.01],
+        )
     ]
-    plate = plate_at([centre[0], centre[1] - 0.014, top + 0.045])
+    marker = plate_at([centre[0], centre[1] - 0.014, high[2] + 0.045])
     declared = {
         "body": {
-            "size_m": [width, thickness, height],
-            "thickness_m": thickness,
-            "density_kg_m3": density,
+            "size_m": [CLOTH_SIZE_M[0], CLOTH_THICK_M, CLOTH_SIZE_M[1]],
+            "thickness_m": CLOTH_THICK_M,
+            "density_kg_m3": CLOTH_DENSITY_KG_M3,
         },
         "grip": {
-            "region_min_m": [low[0] - 1e-3, centre[1] - 1e-2, top - 1e-3],
-            "region_max_m": [high[0] + 1e-3, centre[1] + 1e-2, top + 1e-3],
+            "region_min_m": [low[0] - 1e-3, centre[1] - 1e-2, high[2] - held_m],
+            "region_max_m": [high[0] + 1e-3, centre[1] + 1e-2, high[2] + 1e-3],
         },
     }
     return _play(
-        "sheet", Surface(mesh.triangles(), rest), positions, jaws, plate, pose, centre, declared,
-        {"youngs_modulus_pa": young}, target=(centre[0], centre[1], top - 0.13), distance=0.62, table_m=top - 0.45,
+        "sheet", Surface(triangles, rest), positions, jaws, marker, _swing, centre, declared, truth,
+        target=(centre[0], centre[1], high[2] - 0.13), distance=0.62, table_m=high[2] - 0.45,
     )  # fmt: skip
 
 
@@ -262,6 +314,7 @@ PLAYS = {
     "rope": rope,
     "rope_in_air": partial(rope, drag_per_s=DRAG_PER_S),
     "cloth": cloth,
+    "clamped_cloth": clamped_cloth,
 }
 
 

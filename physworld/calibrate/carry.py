@@ -10,8 +10,9 @@ t0,
     k0'(s) = R(alpha - psi s / L) k0(s)        t0' = t0 - psi / L
 
 and so is its rest shape, which creeps and slips whenever somebody coils, carries or grips it: from the shape that was
-carried over it is found anew, with the deviations that a calibration gives a shape of which nothing is known. Both are
-found on the training frames of the new recording; nothing else is.
+carried over it is found anew, with the deviations that a calibration gives a shape of which nothing is known. All of
+it is found on the training frames of the new recording, and so is, last, where tracked points lie in the body
+(:mod:`physworld.calibrate.places`); nothing else is.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from physworld.arrays import Array
 from physworld.calibrate.descents import Optimum
 from physworld.calibrate.global_stage import free_optional
 from physworld.calibrate.parameters import level, release
+from physworld.calibrate.places import placed_as_seen
 from physworld.calibrate.rod_parameters import SHAPE, rod_parameters
 from physworld.calibrate.rod_search import RodSearch
 from physworld.calibrate.search import Search
@@ -53,6 +55,7 @@ def carried_over(twin: Twin, scene: Scene, particle_budget: int = 2000) -> Twin:
 
     Raises:
         SceneUnsupported: the scene's body is of another dimension, or a rod with other points.
+        SimulationError: with that material the training frames cannot be simulated.
     """
     own = build_twin(
         scene, particle_budget, twin.device, plasticity=twin.plasticity, formulation=twin.formulation,
@@ -72,8 +75,11 @@ def carried_over(twin: Twin, scene: Scene, particle_budget: int = 2000) -> Twin:
         properties=twin.properties if same else None,
     )
     if twin.natural is not None:
-        return _shaped_as_seen(_rolled_as_seen(twin, taken, scene), scene)
-    return _set_up_as_seen(taken, scene)
+        found = _shaped_as_seen(_rolled_as_seen(twin, taken, scene), scene)
+    else:
+        found = _set_up_as_seen(taken, scene)
+    nodes = found.simulate_nodes(*scene.control_track(), scene.times[: scene.train[1]])
+    return placed_as_seen(scene, found, nodes)
 
 
 def _set_up_as_seen(own: Twin, scene: Scene) -> Twin:

@@ -317,7 +317,7 @@ def calibrate_cloth(
     kept = (journal or Journal()).step("cloth", descend)
     theta, covariance = np.array(kept["theta"]), np.linalg.inv(np.array(kept["matrix"]))
     predicted = [
-        recorded(part.scene, at(part.twin, part.unknowns, theta[of_recording(unknowns, k)]))
+        recorded(part.scene, at(part.twin, part.unknowns, theta[of_recording(unknowns, k)]), config.placed)
         for k, part in enumerate(parts)
     ]
     lead = predicted[0]

@@ -11,7 +11,7 @@
    knew less. Drop again what the others made needless, also the yield of a flow law, which is searched with the
    stiffness from the first scan on.
 4. Shift the tracked points in the body, those of a rope with its sections, by their mean residual (frame 0 is noisy
-   too), clipped at 3 sigma.
+   too), clipped at 3 sigma; of a start as measured, whose first frame says less: :mod:`physworld.calibrate.places`.
 5. Gauss-Newton again on all that were kept; hold at its prior what the data turn out not to fix; intervals and
    correlations from the sensitivities at the optimum, wider by what controllers and ends of the body may err by.
 
@@ -108,6 +108,8 @@ class CalibrationConfig:
         plate.
         held: of a discrete rod, the numbers that are not searched and stay as the declared physics has them: names of
             :func:`physworld.calibrate.rods.rod_parameters`, or how they begin.
+        placed: whether, of a start as measured, the training frames say where tracked points lie in the body
+            (:mod:`physworld.calibrate.places`), or the first frame alone.
     """
 
     particle_budget: int = 2000
@@ -121,6 +123,7 @@ class CalibrationConfig:
     plasticity: str | None = None
     mesh: Mesh | None = None
     held: tuple[str, ...] = ()
+    placed: bool = True
 
 
 @dataclass(frozen=True)
@@ -203,7 +206,7 @@ def calibrate(
     search.limit = config.max_simulations - min(_KEPT_BACK, config.max_simulations // 4)
     kept, optimum, rejected = select(search, parameters)
     search.limit = config.max_simulations - (len(kept) + 1 if config.max_simulations > _KEPT_BACK else 0)
-    if search.shift_points(kept, optimum.theta):
+    if search.shift_points(kept, optimum.theta, config.placed):
         optimum = search.solve(kept, optimum.theta, 5)
     search.limit = config.max_simulations
     kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)

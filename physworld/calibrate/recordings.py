@@ -24,6 +24,7 @@ from physworld.arrays import Array
 from physworld.calibrate.descents import Optimum, Place
 from physworld.calibrate.estimates import training_losses
 from physworld.calibrate.parameters import OF_RECORDING, Parameter
+from physworld.calibrate.places import placed_as_seen
 from physworld.calibrate.search import Progress, Search
 from physworld.errors import SceneUnsupported
 from physworld.estimation.journal import Journal
@@ -83,9 +84,17 @@ class Agreement:
         return all(shift is None or abs(shift) <= _APART for shift in self.shifts)
 
 
-def recorded(scene: Scene, twin: Twin) -> Recorded:
-    """What a calibrated twin predicts of its recording."""
+def recorded(scene: Scene, twin: Twin, placed: bool = False) -> Recorded:
+    """What a calibrated twin predicts of its recording.
+
+    Args:
+        scene: the recording.
+        twin: calibrated.
+        placed: find where its tracked points lie in the body (:mod:`physworld.calibrate.places`).
+    """
     nodes = twin.simulate_nodes(*scene.control_track(), scene.times)
+    if placed:
+        twin = placed_as_seen(scene, twin, nodes)
     tracks = twin.observe(nodes, scene.times)
     return Recorded(scene, twin, tracks, twin.particles_at(nodes), training_losses(scene, tracks))
 
@@ -278,10 +287,12 @@ class SharedSearch(Search):
         residual = np.concatenate(found)
         return residual, float(np.sqrt(np.mean(residual**2)))
 
-    def shift_points(self, parameters: list[Parameter], theta: Array) -> bool:
+    def shift_points(self, parameters: list[Parameter], theta: Array, placed: bool = True) -> bool:
         """Move the tracked points of every recording: see :meth:`Search.shift_points`."""
         moved = [
-            self._lent(part, lambda part, own, there: part.shift_points(own, there), k, parameters, theta)
+            self._lent(
+                part, lambda part, own, there: part.shift_points(own, there, placed), k, parameters, theta
+            )
             for k, part in enumerate(self.parts)
         ]
         self.twin = self.parts[0].twin

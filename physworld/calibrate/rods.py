@@ -127,7 +127,10 @@ def calibrate_rod(
         if number >= len(ends) and np.all(np.array(search.left) > _STEADY * before):
             break
     found, correlated, agreement = _estimates(search, unknowns, theta)
-    each = [recorded(part.scene, twin_at(part.twin, unknowns, theta, k)) for k, part in enumerate(parts)]
+    each = [
+        recorded(part.scene, twin_at(part.twin, unknowns, theta, k), config.placed)
+        for k, part in enumerate(parts)
+    ]
     return FitResult(
         twin=each[0].twin,
         parameters={**found, "density": _density(scenes[0], each[0].twin)},

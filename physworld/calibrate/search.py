@@ -27,6 +27,7 @@ from physworld.calibrate.descents import (
     measured_together,
 )
 from physworld.calibrate.parameters import Parameter
+from physworld.calibrate.places import misplaced_by
 from physworld.calibrate.taut import taut_starts
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.estimation.journal import Journal
@@ -320,37 +321,38 @@ class Search:
         """Whether several recordings agree on the object's numbers: of one there is nothing to be said."""
         return ()
 
-    def shift_points(self, parameters: list[Parameter], theta: Array) -> bool:
+    def shift_points(self, parameters: list[Parameter], theta: Array, placed: bool = True) -> bool:
         """Move the tracked points by their mean residual: inside a solid, within a sheet and across it, with a rope's
-        sections."""
-        sigma = self.scene.noise_sigma_m
-        if self.scene.initial_state != UNDEFORMED_AT_REST or not sigma:
+        sections. Of a start as measured they are moved only if ``placed``, by :mod:`physworld.calibrate.places`."""
+        undeformed = self.scene.initial_state == UNDEFORMED_AT_REST
+        sigma = self.scene.noise_sigma_m if undeformed else None
+        if not (sigma if undeformed else placed):
             return False
-        found = self.step("shift", lambda: {"shift": self._mean_offsets(parameters, theta, sigma)})["shift"]
-        if found is None:
-            return False
-        self.twin = moved(self.twin, np.array(found))
-        return True
+        found = self.step("shift", lambda: {"shift": self._offsets(parameters, theta, sigma)})["shift"]
+        self.twin = self.twin if found is None else moved(self.twin, np.array(found))
+        return found is not None
 
-    def _mean_offsets(
-        self, parameters: list[Parameter], theta: Array, sigma: float
+    def _offsets(
+        self, parameters: list[Parameter], theta: Array, sigma: float | None
     ) -> list[list[float]] | None:
-        """Mean residual of every point in the material's frame [m], (N, 3), clipped; None where it cannot be had."""
+        """Of every point in the material's frame [m], (N, 3), clipped at deviations of the noise ``sigma``, or where
+        that is None by :func:`misplaced_by`; None where they cannot be had."""
         if not self._reaches(2 + len(parameters)):
             return None  # the search on the moved points needs a residual and a Jacobian of its own
         twin = self.at(parameters, theta)
-        times, controls = self.scene.control_track()
+        frames = self.scene.times[: self.scene.train[1]]
         try:
-            nodes = twin.simulate_nodes(
-                times, controls, self.scene.times[: self.scene.train[1]], progress=self._poll
-            )
+            nodes = twin.simulate_nodes(*self.scene.control_track(), frames, progress=self._poll)
         except SimulationError:
             return None
         self.simulations += 1
-        frames = slice(self.begin, self.end)
-        mask = self.scene.visible[frames]
-        error = np.where(mask[..., None], self.scene.points[frames] - twin.track_nodes(nodes)[frames], 0.0)
-        gradient = (responses if twin.lattice.dim == 1 else material_frames)(twin, nodes)[frames]
+        if sigma is None:
+            shifts = misplaced_by(self.scene, twin, nodes)
+            return None if shifts is None else list(shifts.tolist())
+        own = slice(self.begin, self.end)
+        mask = self.scene.visible[own]
+        error = np.where(mask[..., None], self.scene.points[own] - twin.track_nodes(nodes)[own], 0.0)
+        gradient = (responses if twin.lattice.dim == 1 else material_frames)(twin, nodes)[own]
         local = np.linalg.solve(gradient, error[..., None])[..., 0]
         seen = np.maximum(mask.sum(axis=0), 1)[:, None]
         limit = _OFFSET_CLIP_SIGMAS * sigma

@@ -88,8 +88,10 @@ class Beginning:
             # the search for a rod's stiffness ends in a wrong basin without its losses, which come off later
             damping = "auto" if form in ("auto", RODS.name) else damping
         if twin is None or twin.form.name != (form if form != "auto" else twin.form.name):
-            # fibres would go into a free shape of bending
-            declared = replace(config.calibration, bending="declared", formulation=form, damping=damping)
+            # fibres would go into a free shape of bending, effects into where points lie
+            declared = replace(
+                config.calibration, bending="declared", formulation=form, damping=damping, placed=False
+            )
             fitted = calibrate(
                 recordings.lead.scene, declared, self.progress, self.cancelled, journal, runner=self.runner
             )

@@ -18,6 +18,7 @@ from physworld.calibrate import CalibrationConfig
 from physworld.calibrate.parameters import bending_ratio
 from physworld.engine.thin.triangles import Mesh
 from physworld.materials.sheet import SheetLaw
+from physworld.scene import UNDEFORMED_AT_REST
 from physworld.trace import TraceConfig, trace
 from physworld.trace.recordings import placed_in
 from physworld.twin.twin import Twin
@@ -134,7 +135,8 @@ def _undamped_twin(stores: Stores, fit_id: str | None, asked: FitConfig, scene_i
     """The fit's twin where its physics is the declared one and its cells are those asked for; else None.
 
     A sheet whose bending has a shape of its own is none: an effect such as fibres may have gone into it. Of a fit of
-    another recording the parameters are taken, in a body that stands where the traced scene starts.
+    another recording, or of a start as measured, the parameters are taken, in a body that stands where the traced
+    scene starts and has its points where the first frame says.
     """
     if fit_id is None:
         return None
@@ -152,6 +154,7 @@ def _undamped_twin(stores: Stores, fit_id: str | None, asked: FitConfig, scene_i
     damped = re.compile("drag|viscosity|relaxation")
     if any(value for name, value in twin.parameters.items() if damped.search(name)):
         return None
-    if fit.scene_id == scene_id:
+    scene = scene_of(stores, scene_id)
+    if fit.scene_id == scene_id and scene.initial_state == UNDEFORMED_AT_REST:
         return twin
-    return placed_in(scene_of(stores, scene_id), twin, asked.particle_budget)
+    return placed_in(scene, twin, asked.particle_budget)
