@@ -9,8 +9,8 @@ import pytest
 from sagging_bar import BUDGET, TRUE_PA, sagging
 
 from physworld.calibrate import CalibrationConfig, calibrate, carried_over
-from physworld.calibrate.places import PLACE_SHARE, placed_as_seen
-from physworld.estimation.whitening import moved
+from physworld.calibrate.places import placed_as_seen
+from physworld.estimation.whitening import moved, place_deviation
 from physworld.evaluate.metrics import track_error
 from physworld.scene import AS_MEASURED, Scene
 from physworld.twin.build import build_twin
@@ -47,8 +47,8 @@ def held_out(scene: Scene, tracks: Array) -> float:
 def test_places_are_found_beside_an_error_of_the_model_that_dies_away() -> None:
     scene, twin, nodes = recording(shifts(), wobble_m=2e-3)
     found = placed_as_seen(scene, twin, nodes)
-    assert np.abs(found.body.points - twin.body.points - shifts()).max() < 1e-4
-    assert held_out(scene, found.observe(nodes, scene.times)) < 2.0 * SIGMA
+    assert np.abs(found.body.points - twin.body.points - shifts()).max() < 2e-4
+    assert held_out(scene, found.observe(nodes, scene.times)) < 3.0 * SIGMA
     early = placed_as_seen(scene, twin, nodes[: scene.train[1]])  # nothing but training frames enters
     assert np.array_equal(early.body.points, found.body.points)
 
@@ -65,10 +65,10 @@ def test_points_that_nothing_shows_stay_and_far_shifts_are_held_back() -> None:
     hidden[1:, 2] = False
     found = placed_as_seen(replace(scene, visible=hidden), twin, nodes)
     assert np.abs(found.body.points - twin.body.points)[2].max() < 1e-6
-    extent = np.linalg.norm(np.ptp(np.concatenate([scene.points[0], scene.controllers[0]]), axis=0))
-    wild = 10.0 * PLACE_SHARE * extent * np.random.default_rng(1).normal(size=scene.points.shape)
+    deviation = place_deviation(scene, SIGMA)
+    wild = 10.0 * deviation * np.random.default_rng(1).normal(size=scene.points.shape)
     found = placed_as_seen(replace(scene, points=scene.points + wild), twin, nodes)
-    assert np.abs(found.body.points - twin.body.points).max() < 4.0 * PLACE_SHARE * extent
+    assert np.abs(found.body.points - twin.body.points).max() < 4.0 * deviation
 
 
 @pytest.mark.slow
@@ -78,7 +78,7 @@ def test_a_calibration_places_points_and_so_does_material_that_is_carried_over()
     found = calibrate(scene, config)
     first = calibrate(scene, replace(config, placed=False))
     assert found.parameters["youngs_modulus_pa"].value == pytest.approx(TRUE_PA, rel=2e-4)
-    assert held_out(scene, first.tracks) > 5e-4 and held_out(scene, found.tracks) < 2.0 * SIGMA
+    assert held_out(scene, first.tracks) > 5e-4 and held_out(scene, found.tracks) < 3.0 * SIGMA
     carried = carried_over(found.twin, scene, BUDGET)
     nodes = carried.simulate_nodes(*scene.control_track(), scene.times)
-    assert held_out(scene, carried.observe(nodes, scene.times)) < 2.0 * SIGMA
+    assert held_out(scene, carried.observe(nodes, scene.times)) < 3.0 * SIGMA
