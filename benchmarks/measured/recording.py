@@ -81,8 +81,9 @@ def transfer(
 ) -> dict[str, Any]:
     """A recording predicted with the material of another one (:func:`physworld.calibrate.carried_over`).
 
-    Of a discrete rod the roll in which it was gripped and its rest shape are found on this recording's training frames;
-    otherwise nothing of it is fitted to. The other models are those fitted to the other recording.
+    What belongs to this recording is found on its training frames, nothing else is: the roll and rest shape of a
+    discrete rod, release and level of a solid, places of tracked points. The other models are those fitted to the other
+    recording.
 
     Args:
         source: the other recording; every model is fitted to its training frames.

@@ -3,7 +3,7 @@
 A point's place in the material comes from the first frame. Where the scene starts undeformed that is as good as the
 tracking (:meth:`physworld.calibrate.search.Search.shift_points`). Where it starts as measured, the body between its
 points has a shape that is interpolated: bent by a load, or propped by a hand that nobody declares, it errs by more
-than the tracking (:func:`physworld.estimation.whitening.place_deviation`).
+than the tracking.
 
 With the fitted motion kept, each point's shift is the ridge solution of its residuals. Frames near each other err
 alike, so a block of frames counts once. All frames count alike: those that err least are the first ones, which the
@@ -15,10 +15,12 @@ from __future__ import annotations
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.estimation.whitening import moved, place_deviation, responses
+from physworld.estimation.whitening import moved, responses
 from physworld.scene import UNDEFORMED_AT_REST, Scene
 from physworld.twin.twin import Twin
 
+PLACE_SHARE = 0.01
+"""Standard deviation of a place, of the extent of points and grips in the first frame."""
 _BLOCKS, _LEAST_M = 12, 1e-7
 
 
@@ -42,9 +44,10 @@ def misplaced_by(scene: Scene, twin: Twin, nodes: Array) -> Array | None:
     seen = scene.visible[frames]
     tracks = twin.observe(nodes, scene.times[: len(nodes)])[frames]
     error = np.where(seen[..., None], scene.points[frames] - tracks, 0.0)
-    if not np.isfinite(error).all():
+    first = np.concatenate([scene.points[0][scene.visible[0]], scene.controllers[0]])
+    if not len(first) or not np.isfinite(error).all():
         return None
-    deviation = place_deviation(scene, max(scene.noise_sigma_m or 0.0, _LEAST_M))
+    deviation = PLACE_SHARE * float(np.linalg.norm(np.ptp(first, axis=0))) + _LEAST_M
     response = responses(twin, nodes)[frames]
     square = float((error**2).sum()) / max(3 * int(seen.sum()), 1) + _LEAST_M**2
     weight = min(_BLOCKS, len(error)) / len(error) / square

@@ -2,11 +2,11 @@
 
 The covariance of measured minus predicted is sigma^2 (I + G G^T): sigma the tracking noise; G the response of a tracked
 point to its own place in the body, which frame 0 gives with the same noise (a rigid body shows it as a shift that turns
-with it), or with more where the body starts as measured (:func:`place_deviation`). Where a scene declares a covariance
-for every point, all of this holds after its factor is divided out (:meth:`physworld.scene.Scene.weighed`). Beside a
-model's own error of (e - 1) sigma^2 in every sighting it is sigma^2 (e I + G G^T), whitened as I + G G^T / e
-(:meth:`Whitener.beside`). W with W^T W the inverse is applied to residuals and to sensitivities alike, so that ordinary
-least squares of whitened quantities is the generalised one. G acts point by point, so thin factors do.
+with it). Where a scene declares a covariance for every point, all of this holds after its factor is divided out
+(:meth:`physworld.scene.Scene.weighed`). Beside a model's own error of (e - 1) sigma^2 in every sighting it is sigma^2
+(e I + G G^T), whitened as I + G G^T / e (:meth:`Whitener.beside`). W with W^T W the inverse is applied to residuals and
+to sensitivities alike, so that ordinary least squares of whitened quantities is the generalised one. G acts point by
+point, so thin factors do.
 
 A rope or a sheet that is declared undeformed lies along the line or in the plane of its first points. Their noise
 turns it as a whole: a rope of nine markers by about sigma / (2 L), and then it swings as under a tilted gravity. Turns
@@ -30,26 +30,6 @@ from physworld.twin.twin import Twin
 
 _LEAST_LEVER = 0.05  # of the body's size: points nearer to an axis than this say nothing of a turn about it
 _SHIFT_M = 1e-4  # of a tracked point, to see how its track answers
-_PLACE_SHARE = (
-    0.01  # of the extent of points and grips, that a place in a body which starts as measured may err by
-)
-
-
-def place_deviation(scene: Scene, sigma: float) -> float:
-    """Standard deviation of a tracked point's place in the body, as the first frame tells it [m].
-
-    It is the noise where the body starts undeformed. A start as measured is bent by loads or by hands, and its shape is
-    interpolated between the points: a marker that stands off the body errs by its lever times the error of the slope.
-
-    Args:
-        scene: what was measured.
-        sigma: tracking noise [m].
-    """
-    if scene.initial_state != AS_MEASURED:
-        return sigma
-    first = np.concatenate([scene.points[0][scene.visible[0]], scene.controllers[0]])
-    extent = float(np.linalg.norm(np.ptp(first, axis=0))) if len(first) else 0.0
-    return max(sigma, _PLACE_SHARE * extent)
 
 
 @dataclass(frozen=True)
@@ -95,7 +75,7 @@ class Whitener:
         weights: of every tracked point, (N, 3, 3): inverse factor of its covariance over sigma^2; None: the same noise
             along every axis.
         spreads: of every tracked point's own place along its material axes for a deviation of each of its noises,
-            (N, 3, 3), over sigma; None: sigma along each.
+            (N, 3, 3), over sigma; None as above.
     """
 
     measured: Array
@@ -264,10 +244,6 @@ def whitener(scene: Scene, split: Split, sigma: float, responses: Array) -> Whit
         weights = np.linalg.inv(factors)
         spreads = np.linalg.pinv(responses[0]) @ factors
         responses = weights @ responses @ spreads
-    if (doubt := place_deviation(scene, sigma) / sigma) > 1.0:
-        spreads = doubt * (np.eye(responses.shape[-1]) if spreads is None else spreads)
-        spreads = np.broadcast_to(spreads, (scene.points.shape[1], 3, responses.shape[-1]))
-        responses = doubt * responses
     places = []
     for point in range(visible.shape[1]):
         rows = np.nonzero(points == point)[0]

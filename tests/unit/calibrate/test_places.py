@@ -9,8 +9,8 @@ import pytest
 from sagging_bar import BUDGET, TRUE_PA, sagging
 
 from physworld.calibrate import CalibrationConfig, calibrate, carried_over
-from physworld.calibrate.places import placed_as_seen
-from physworld.estimation.whitening import moved, place_deviation
+from physworld.calibrate.places import PLACE_SHARE, placed_as_seen
+from physworld.estimation.whitening import moved
 from physworld.evaluate.metrics import track_error
 from physworld.scene import AS_MEASURED, Scene
 from physworld.twin.build import build_twin
@@ -65,7 +65,8 @@ def test_points_that_nothing_shows_stay_and_far_shifts_are_held_back() -> None:
     hidden[1:, 2] = False
     found = placed_as_seen(replace(scene, visible=hidden), twin, nodes)
     assert np.abs(found.body.points - twin.body.points)[2].max() < 1e-6
-    deviation = place_deviation(scene, SIGMA)
+    first = np.concatenate([scene.points[0], scene.controllers[0]])
+    deviation = PLACE_SHARE * np.linalg.norm(np.ptp(first, axis=0))
     wild = 10.0 * deviation * np.random.default_rng(1).normal(size=scene.points.shape)
     found = placed_as_seen(replace(scene, points=scene.points + wild), twin, nodes)
     assert np.abs(found.body.points - twin.body.points).max() < 4.0 * deviation

@@ -9,8 +9,8 @@ import pytest
 from made_scene import made_scene
 
 from physworld.estimation.noise import freeze
-from physworld.estimation.whitening import place_deviation, whitener
-from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, sigma_of
+from physworld.estimation.whitening import whitener
+from physworld.scene import sigma_of
 
 SIGMA, FRAMES, POINTS = 2e-3, 9, 3
 
@@ -22,31 +22,22 @@ def parts() -> tuple:
     scene = made_scene(rng.normal(size=(POINTS, 3)), "blob", frames=FRAMES)
     visible = rng.uniform(size=(FRAMES, POINTS)) < 0.7
     visible[0] = True
-    points = scene.points + rng.normal(size=scene.points.shape)
-    scene = replace(scene, visible=visible, points=points, initial_state=UNDEFORMED_AT_REST)
+    scene = replace(scene, visible=visible, points=scene.points + rng.normal(size=scene.points.shape))
     responses = rng.normal(size=(FRAMES, POINTS, 3, 3))
     return scene, freeze(scene, 4, 1), responses, rng.normal(size=scene.points.shape)
 
 
-@pytest.mark.parametrize(
-    ("beside", "start"), [(1.0, UNDEFORMED_AT_REST), (40.0, UNDEFORMED_AT_REST), (40.0, AS_MEASURED)]
-)
-def test_whitened_products_are_those_of_the_inverse_covariance(
-    parts: tuple, beside: float, start: str
-) -> None:
-    """Of noise and places, also beside an error of the model of which a place is no larger part than it is. Of a start
-    as measured a place is known to a hundredth of the body."""
+@pytest.mark.parametrize("beside", [1.0, 40.0])
+def test_whitened_products_are_those_of_the_inverse_covariance(parts: tuple, beside: float) -> None:
+    """Of noise and places, also beside an error of the model of which a place is no larger part than it is."""
     scene, split, responses, tracks = parts
-    scene = replace(scene, initial_state=start)
-    doubt = place_deviation(scene, SIGMA) / SIGMA
-    assert (doubt > 3.0) is (start == AS_MEASURED)
     white = whitener(scene, split, SIGMA, responses).beside(beside)
     seen = scene.visible[slice(*split.train)]
     frames, points = np.nonzero(seen)
     place = np.zeros((3 * len(frames), 3 * POINTS))
     for row, (frame, point) in enumerate(zip(frames, points, strict=True)):
         place[3 * row : 3 * row + 3, 3 * point : 3 * point + 3] = responses[frame + split.train[0], point]
-    covariance = SIGMA**2 * (np.eye(len(place)) + doubt**2 * place @ place.T / beside)
+    covariance = SIGMA**2 * (np.eye(len(place)) + place @ place.T / beside)
     error = (scene.points - tracks)[slice(*split.train)][seen].reshape(-1)
     change = tracks[slice(*split.train)][seen].reshape(-1)
     got = white.residual(tracks)
@@ -79,17 +70,6 @@ def test_the_place_of_a_point_is_found_and_clipped(parts: tuple) -> None:
     found = white.place_errors(scene.points - shift)
     expected = shift * (sightings / (1 + sightings))[:, None]
     assert found == pytest.approx(np.clip(expected, -3 * SIGMA, 3 * SIGMA), rel=1e-9, abs=1e-12)
-
-
-def test_places_of_a_start_as_measured_may_lie_farther_off(parts: tuple) -> None:
-    scene, split, _, _ = parts
-    scene = replace(scene, initial_state=AS_MEASURED)
-    white = whitener(scene, split, SIGMA, np.broadcast_to(np.eye(3), (FRAMES, POINTS, 3, 3)))
-    sightings = scene.visible[slice(*split.train)].sum(axis=0)
-    shift = 2.0 * place_deviation(scene, SIGMA) * np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, -1.0]])
-    doubt = (place_deviation(scene, SIGMA) / SIGMA) ** 2
-    expected = shift * (doubt * sightings / (1 + doubt * sightings))[:, None]
-    assert white.place_errors(scene.points - shift) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
 def test_a_point_without_a_place_is_left_out_unless_none_has_one(parts: tuple) -> None:
