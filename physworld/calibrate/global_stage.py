@@ -206,7 +206,8 @@ def calibrate(
     search.limit = config.max_simulations - min(_KEPT_BACK, config.max_simulations // 4)
     kept, optimum, rejected = select(search, parameters)
     search.limit = config.max_simulations - (len(kept) + 1 if config.max_simulations > _KEPT_BACK else 0)
-    if search.shift_points(kept, optimum.theta, config.placed):
+    shifted = search.shift_points(kept, optimum.theta, config.placed)
+    if shifted:
         optimum = search.solve(kept, optimum.theta, 5)
     search.limit = config.max_simulations
     kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)
@@ -216,7 +217,8 @@ def calibrate(
     found, correlated = _estimates(search, kept, optimum, solution, changes)
     if search.cut_short:
         found = cut_short(found, config.max_simulations)
-    each = [recorded(known, search.at(kept, optimum.theta, k)) for k, known in enumerate(scenes)]
+    left = config.placed and not shifted  # for want of simulations
+    each = [recorded(known, search.at(kept, optimum.theta, k), left) for k, known in enumerate(scenes)]
     held = held_at_priors(scenes[0], each[0].twin, rejected, parameters)
     return FitResult(
         twin=each[0].twin,

@@ -84,7 +84,7 @@ class Agreement:
         return all(shift is None or abs(shift) <= _APART for shift in self.shifts)
 
 
-def recorded(scene: Scene, twin: Twin, placed: bool = False) -> Recorded:
+def recorded(scene: Scene, twin: Twin, placed: bool) -> Recorded:
     """What a calibrated twin predicts of its recording.
 
     Args:
