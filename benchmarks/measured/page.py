@@ -99,8 +99,8 @@ def _transfers(transfers: dict[str, Any]) -> list[str]:
             f"{mm(here['twin_fitted_here'])}), {hertz[0]} Hz of {hertz[1]} measured"
         )
     return [
-        "Material of one recording in another, over all its frames, twin / best of the others [mm] (a rod's roll and "
-        "rest shape are found on the training frames): " + "; ".join(parts) + "."
+        "Material of one recording in another, over all its frames, twin / best of the others [mm] (what belongs to a "
+        "recording, such as a rod's rest shape, is found on its training frames): " + "; ".join(parts) + "."
     ]
 
 

@@ -1,7 +1,8 @@
 """The whole life of a model in the browser, from an empty folder and without the command line: bring a recording in,
 make a model of it, watch that, trace, make a second version, compare, play, keep files, delete everything.
 
-And from a table of markers: what the page guesses of it, what a person has to say, the scene, the published model.
+And from a table of markers, or from a depth camera's pictures: what the page guesses or shows of them, what a person
+has to say, the scene, the published model.
 
 The service is the embedded one in processes of its own; the scenes and every budget are small.
 """
@@ -18,7 +19,10 @@ import pytest
 from dashboard_browser import WATCH_POLICY, Visit
 from playwright.sync_api import Browser, expect
 from service_process import ServiceProcess
+from test_dashboard_first import fill as boxed
+from test_dashboard_first import packed
 from tiny_scene import tiny_scene
+from tracking_pictured import BOTTOM, LEFT, RIGHT, TOP, write
 
 from physworld_scenes.bundle import canonical_archive, read_bundle
 
@@ -224,12 +228,46 @@ def test_from_a_table_of_markers_to_a_published_model(life: Visit, tmp_path: Pat
     expect(page.locator("main")).to_contain_text("80 tracked, 12 controllers")
     visit.points_shown()
 
-    # the pipeline, with small settings, up to the page of the published version
-    page.get_by_role("link", name="Make a world model").click()
-    fill(visit, model_name="beam", **SMALL)
+    published(visit, "beam")
+
+
+def test_from_pictures_to_a_published_model(life: Visit, tmp_path: Path) -> None:
+    visit, page = life, life.page
+    write(tmp_path / "plate", FRAMES)
+    archive = packed(tmp_path / "plate", tmp_path / "plate.zip")
+    visit.open("/trackings")
+    page.set_input_files("#pictures", archive)
+    page.get_by_role("button", name="Look").click()
+    expect(page.locator("[data-first]")).to_have_attribute("data-ready", "true")
+
+    # where the plate is, what moves it and what that holds; what no picture tells
+    middle = (TOP + BOTTOM) // 2
+    boxed(visit, "Box of the object", (LEFT - 8, TOP - 8, RIGHT + 8, BOTTOM + 8))
+    boxed(visit, "Patch of the gripper", (LEFT + 2, middle - 12, LEFT + 26, middle + 12))
+    boxed(visit, "Box of what is held", (LEFT, TOP, LEFT + 15, BOTTOM))
+    page.get_by_label("What moves the object").select_option("patch")
+    page.locator("select[data-option=up]").select_option("-y")
+    page.locator("select[data-option=kind]").select_option("sheet")
+    page.get_by_label("Mass [kg]").fill("0.05")
+    page.get_by_label("Thickness of a sheet [m]").fill("0.004")
+    page.get_by_role("button", name="Make the scene").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
     done(visit)
-    page.get_by_role("link", name=re.compile("beam, version 1")).first.click()
-    expect(page.locator("h1")).to_contain_text("beam · version 1")
+    page.get_by_role("link", name=re.compile("plate")).first.click()
+    page.wait_for_url(re.compile(r"/scenes/scn_"))
+    expect(page.locator("main")).to_contain_text("8 controllers")
+    visit.points_shown()
+    published(visit, "plate")
+
+
+def published(visit: Visit, name: str) -> None:
+    """The pipeline of the scene that the page shows, with small settings, up to the page of the published version."""
+    page = visit.page
+    page.get_by_role("link", name="Make a world model").click()
+    fill(visit, model_name=name, **SMALL)
+    done(visit)
+    page.get_by_role("link", name=re.compile(f"{name}, version 1")).first.click()
+    expect(page.locator("h1")).to_contain_text(f"{name} · version 1")
     expect(page.locator("h1 .badge").first).to_have_text("ready")
     expect(page.locator("table.held-out")).to_contain_text("World model")
     visit.points_shown()
