@@ -1,10 +1,10 @@
-"""What the cameras look at: a beam, a rope and a cloth of known material, moved by engines that are not ours.
+"""What the cameras look at: a beam, a rope, a cloth and a toy of known material, moved by engines that are not ours.
 
 The beam is MuJoCo's flex of ``scripts/make_sample_scene.py``, the bar the same of finite elements whose modulus is
 that of the material (``benchmarks.peers.finite_elements``), in a vacuum or in air, or soft in its middle, the rope
 the chain of ``scripts/make_sample_rope.py``, the cloth MuJoCo's flex of ``benchmarks.peers.flex_cloths`` or, clamped,
-those elements. A gripper of boxes holds them, covers what it holds, and carries an ArUco marker; a stick goes by
-between object and camera in the second second.
+those elements, as is the toy. A gripper of boxes holds them, covers what it holds, and carries an ArUco marker; a stick
+goes by between object and camera in the second second.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ SOFT_LOG, SOFT_WIDTH = -1.2, 0.18
 """Of the uneven bar: logarithm of its modulus in the middle over the ends', deviation of the dip over its length."""
 CLOTH_SIZE_M, CLOTH_THICK_M, CLOTH_DENSITY_KG_M3, CLOTH_PA = (0.25, 0.27), 0.0045, 370.0, 2e5
 CLAMPED_CELLS, CLAMPED_M, CLOTH_POISSON = (12, 18), 0.03, 0.3
+TOY_PA, TOY_DENSITY_KG_M3, TOY_HELD_M = 1.2e5, 900.0, 0.04
 MARKER_SIDE_M = 0.05
 """Of the marker itself; the plate that it is printed on is a fifth wider on every side."""
 MARKER_ID = 7
@@ -306,6 +307,50 @@ def _hung(triangles: Array, positions: Array, held_m: float, jaws_m: float, trut
     )  # fmt: skip
 
 
+def toy(frames: int = FRAMES) -> Play:
+    """A soft body of no simple shape, of quadratic finite elements: round, thin in its middle, arched; a gripper holds
+    one end, lifts, swings aside and turns."""
+    from benchmarks.peers.finite_elements import Acting, Elements, record
+
+    def shape(unit: Array) -> Array:
+        along, square = unit[:, 0], 2.0 * unit[:, 1:] - 1.0
+        disc = square * np.sqrt(1.0 - 0.3 * square[:, ::-1] ** 2)  # a square with round corners
+        radius = 0.024 + 0.01 * np.cos(2.0 * np.pi * along)
+        arch = 0.03 * np.sin(np.pi * along)
+        low = make_sample_scene.Recipe().corner_m
+        return np.stack(
+            [low[0] + 0.24 * along, radius * disc[:, 0], 0.5 + arch + radius * disc[:, 1]], axis=1
+        )
+
+    elements = Elements((9, 2, 2), shape, TOY_PA, 0.35, TOY_DENSITY_KG_M3)
+    end = float(elements.nodes[:, 0].min()) + TOY_HELD_M
+    held = np.flatnonzero(elements.nodes[:, 0] <= end + 1e-9)
+    path = record(elements, Acting(), [(held, make_sample_scene.grip_pose)], np.arange(frames) / FPS)
+    places, triangles = box_skin(33, 13)
+    nodes, weights = elements.weights(np.clip(places, 1e-6, 1.0 - 1e-6))
+    positions = np.einsum("pk,tpki->tpi", weights, path[:, nodes])
+    rest = positions[0]
+    low, high = rest.min(axis=0), rest.max(axis=0)
+    centre = elements.nodes[held].mean(axis=0)
+    jaws = [
+        box([low[0] - 0.015, -0.03, 0.538], [end - 0.005, 0.03, 0.553]),
+        box([low[0] - 0.015, -0.03, 0.447], [end - 0.005, 0.03, 0.462]),
+        box([low[0] - 0.09, -0.02, 0.47], [low[0] - 0.015, 0.02, 0.53]),
+    ]
+    declared = {
+        "body": {"density_kg_m3": TOY_DENSITY_KG_M3},
+        "grip": {
+            "region_min_m": [low[0], -0.04, 0.44],
+            "region_max_m": [end, 0.04, 0.56],
+        },
+    }
+    return _play(
+        "toy", Surface(triangles, rest), positions, jaws, plate_at([low[0] - 0.052, -0.024, 0.5]),
+        make_sample_scene.grip_pose, centre, declared, {"youngs_modulus_pa": TOY_PA},
+        target=(float(0.5 * (low[0] + high[0])), 0.0, 0.5), distance=0.62, table_m=0.25,
+    )  # fmt: skip
+
+
 PLAYS = {
     "beam": beam,
     "bar": bar,
@@ -315,6 +360,7 @@ PLAYS = {
     "rope_in_air": partial(rope, drag_per_s=DRAG_PER_S),
     "cloth": cloth,
     "clamped_cloth": clamped_cloth,
+    "toy": toy,
 }
 
 
@@ -384,6 +430,31 @@ def box(low: Any, high: Any) -> tuple[Array, Array]:
 
     shape = trimesh.creation.box(bounds=[low, high])
     return np.asarray(shape.vertices), np.asarray(shape.faces)
+
+
+def box_skin(along: int, across: int) -> tuple[Array, Array]:
+    """Places (V, 3) on the six sides of a box from 0 to 1, and triangles (F, 3), so many points along x and across."""
+    places, triangles, begin = [], [], 0
+    counts = (along, across, across)
+    for axis in range(3):
+        u, v = [other for other in range(3) if other != axis]
+        one, two = np.meshgrid(np.linspace(0, 1, counts[u]), np.linspace(0, 1, counts[v]), indexing="ij")
+        number = np.arange(one.size).reshape(one.shape)
+        a, b, c, d = (
+            part.ravel() for part in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:])
+        )
+        for side in (0.0, 1.0):
+            own = np.zeros((one.size, 3))
+            own[:, u], own[:, v], own[:, axis] = one.ravel(), two.ravel(), side
+            outward = (axis != 1) is (side == 1.0)  # u, v and the axis turn right but for y
+            way = (a, b, c, d) if outward else (a, d, c, b)
+            triangles += [
+                begin + np.stack([way[0], way[1], way[2]], axis=1),
+                begin + np.stack([way[0], way[2], way[3]], axis=1),
+            ]
+            places.append(own)
+            begin += one.size
+    return np.concatenate(places), np.concatenate(triangles)
 
 
 def plate_at(middle: Any) -> tuple[Array, Array, Array]:
