@@ -233,7 +233,7 @@ def cloth(frames: int = FRAMES) -> Play:
 
 
 def clamped_cloth(frames: int = FRAMES, cells: tuple[int, int] = CLAMPED_CELLS) -> Play:
-    """The same cloth and motion of quadratic finite elements: a plate, whose upper row of elements the bar holds.
+    """The same cloth and motion of quadratic finite elements: a plate, of which the bar holds the upper ``CLAMPED_M``.
 
     Args:
         frames: T.

@@ -67,7 +67,7 @@ def filling(kind: str, placed: Placed, mask: Array, behind: float) -> Array | No
 def gripper_way(
     placed: Placed, small: View, factor: float, grip: GripFrom, times: Array, warnings: list[str]
 ) -> RigidPath:
-    """The gripper's motion [m]; a log is in the scene's world already.
+    """The gripper's motion [m]; a log, or the robot's base that it is told in, is in the scene's world already.
 
     Args:
         placed: the recording on its plane.
