@@ -115,11 +115,9 @@ class LogFrame:
             turned: the cameras' world in the scene's, 4 × 4; None: they are one.
 
         Raises:
-            TrackingFailed: a number is not finite, or the quaternion's length is not 1 within a hundredth.
+            TrackingFailed: the quaternion's length is not 1 within a hundredth.
         """
         given = np.asarray(pose, dtype=np.float64)
-        if not np.isfinite(given).all():
-            raise TrackingFailed(f"the pose of the robot's base has numbers that are not finite: {given}")
         length = float(np.linalg.norm(given[3:]))
         if not abs(length - 1.0) <= UNIT_WITHIN:
             raise TrackingFailed(f"the quaternion of the robot's base has length {length:.4g}, not 1")
