@@ -55,6 +55,9 @@ CASES = (
     Case("rope, whipped", ("rope_a_whip",), ("rope_a_ring",), every=2),
     Case("rope, shaken", ("rope_c_shake",)),
     Case("cloth, swung", ("cloth_swing",)),
+    Case("rope, shaken up and down", ("rope_b_shake",)),
+    Case("branched cable", ("branched_a",)),
+    Case("arm", ("arm_200mbar",), every=2),
 )  # fmt: skip
 
 
