@@ -10,8 +10,9 @@ import shlex
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from physworld_client.cli.app import app
-from typer.testing import CliRunner
+from typer.main import get_command
 
 from physworld_scenes.bundle import FIELD_OF_ARRAY
 from physworld_scenes.declaration import BodyForm, ColliderForm, Declaration, GripForm, GroundForm
@@ -24,6 +25,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+CLI = get_command(app)
 
 CODE_BLOCK = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
@@ -76,7 +78,7 @@ def test_there_are_command_lines_to_check() -> None:
 @pytest.mark.parametrize(("page", "line"), command_lines())
 def test_quoted_command_lines_parse(page: str, line: str) -> None:
     words = shlex.split(line, comments=True)[1:]
-    result = CliRunner().invoke(app, [*words, "--help"])
+    result = CliRunner().invoke(CLI, [*words, "--help"])
     assert result.exit_code == 0, f"{page}: {line}\n{result.output}"
 
 
