@@ -24,6 +24,7 @@ class TrainingConfig(Request):
     network corrects; ``none``: it stands alone. ``frame``: the axes of a step, ``world``, ``grip`` (the grip's frame,
     where the scene has one) or ``auto``: what errs less on episodes that are not learned from. ``near_edges``:
     ``current`` finds the neighbours anew at every step, so that parts of the object that meet see each other.
+    ``start_from``: a version, perhaps of another object, from whose network the training goes on.
     """
 
     hidden: int = Field(
@@ -82,6 +83,13 @@ class TrainingConfig(Request):
     near_edges: Literal["material", "current"] = Field(
         default="material",
         description="Neighbours fixed in the material, or found anew at every step (parts that meet).",
+    )
+    start_from: str | None = Field(
+        default=None,
+        pattern=r"^[a-z0-9][a-z0-9._-]{0,63}:[a-z0-9][a-z0-9._-]{0,63}$",
+        description="Ready version `name:version` (number or alias) whose network the training goes on from, of the "
+        "same `hidden`, `message_passing_steps` and `history`; null: random weights.",
+        examples=["soft_beam:3"],
     )
     patience: int = Field(
         default=8,

@@ -121,6 +121,7 @@ def remove_version(session: Session, name: str, version: int) -> None:
     row = registry.version_row(session, name, version)
     what = f"version {version} of {name}"
     _refuse_while_made(session, what, row.job_id)
+    _refuse_while_read(session, what, registry.reference_id(name, version))
     aliases = session.scalars(
         select(AliasRow.alias).where(AliasRow.name == name, AliasRow.version == version)
     ).all()
@@ -153,6 +154,13 @@ def _refuse_while_made(session: Session, what: str, job_id: str | None) -> None:
     job = None if job_id is None else session.get(JobRow, job_id)
     if job is not None and job.state not in TERMINAL_STATES:
         raise Conflict(f"{what} is being made by job {job.id}, which is {job.state}; cancel the job first")
+
+
+def _refuse_while_read(session: Session, what: str, object_id: str) -> None:
+    unended = session.scalars(select(JobRow).where(JobRow.state.not_in(TERMINAL_STATES)))
+    job = next((job for job in unended if any(known["id"] == object_id for known in job.inputs)), None)
+    if job is not None:
+        raise Conflict(f"job {job.id}, which is {job.state}, needs {what}; cancel the job first")
 
 
 def _refuse_if_used(session: Session, what: str, object_id: str, dependents: tuple[Dependents, ...]) -> None:

@@ -6,6 +6,7 @@ WorldModelError
 ├── TrainingDiverged     loss or gradient exploded several times in a row (``step`` says from when)
 ├── TrainingCancelled    the caller's ``cancelled`` said so
 ├── CheckpointMismatch   a checkpoint of other settings or other data
+├── NetworkMismatch      a network that another one cannot go on from: other widths, or it hears of more
 ├── VersionUnreadable    a published version that this one cannot read: an older or newer layout
 └── ControlsInvalid      control paths that cannot drive this model (``field`` says which part of them)
 """
@@ -44,6 +45,10 @@ class TrainingCancelled(WorldModelError):
 
 class CheckpointMismatch(WorldModelError):
     """The checkpoint belongs to other settings or other data."""
+
+
+class NetworkMismatch(WorldModelError):
+    """Another network cannot go on from this one's weights."""
 
 
 class VersionUnreadable(WorldModelError):

@@ -128,6 +128,7 @@ def train(
     cancelled: Callable[[], bool] | None = None,
     device: str = "cpu",
     network: Callable[..., WorldModel] = WorldModel,
+    start: WorldModel | None = None,
 ) -> TrainingResult:
     """Train on ``tracks``; see the module's docstring.
 
@@ -146,6 +147,8 @@ def train(
         cancelled: asked before each step; true raises TrainingCancelled.
         device: of the network while it learns, "cpu" or "cuda:0"; data, priors and result are on the CPU.
         network: builds it from the arguments of :class:`WorldModel`.
+        start: a model, perhaps of another body, whose weights it goes on from (:meth:`WorldModel.take`, which may
+            raise NetworkMismatch); the first two validations are then of the prior alone and of these weights.
     """
     if not tracks:
         raise DatasetUnusable("no episode to train on")
@@ -178,6 +181,10 @@ def train(
         _restore(run, checkpoint, identity)
     if run.step == 0:
         _validate(run, held_out, validated)
+        if start is not None:
+            run.model.take(start)
+            run.average.take(start)
+            _validate(run, held_out, validated)
     joined = first
     sampler = WindowSampler(fitting)
     while run.step < training.steps and not _out_of_patience(run, training):

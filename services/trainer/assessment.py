@@ -9,12 +9,10 @@ become worse is the database's business: the commit opens a trace (``physworld_s
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import load as load_tensors
 
 from physworld.arrays import Array
 from physworld.errors import SceneUnsupported
@@ -33,16 +31,16 @@ from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene
 from physworld.twin.twin import Twin
 from physworld.worldmodel.foreign import ForeignPrediction, predict, twin_on
-from physworld.worldmodel.published import PublishedModel
 from physworld_schemas.base import Reference
 from physworld_schemas.model import ModelVersion
 from physworld_services.trainer.closed_loop import METRIC, WORLD_MODEL
 from physworld_services.trainer.measuring import json_safe
+from physworld_services.trainer.publishing import model_of
 from physworld_storage import registry, resources
 from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
 from physworld_workers.stores import Stores
-from physworld_workers.tasks.inputs import named, scene_of, scene_reference, twin_of
+from physworld_workers.tasks.inputs import scene_of, scene_reference, twin_of
 
 PLACING, ROLLING, COMPARING = (
     "placing the twin", "rolling the model out over the recording", "comparing with noise and card",
@@ -67,7 +65,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         placed = _placed(stores, recording, origin)
         context.begin(rolling, "rollouts")
         versions.append(version)
-        predictions.append(predict(_model(stores, version), recording, placed))
+        predictions.append(predict(model_of(stores, version), recording, placed))
     context.begin(COMPARING)
     first = max(predicted.first_frame for predicted in predictions)
     window = scored_frames(recording, first, payload.get("frames", "all"))
@@ -234,10 +232,3 @@ def _placed(stores: Stores, recording: Scene, origin: dict[str, Any]) -> Twin:
     home = scene_of(stores, origin["model_scene_id"])
     twin = twin_of(stores, origin["fit_id"], origin.get("trace_id"))
     return twin_on(recording, home, twin, fit.config.particle_budget)
-
-
-def _model(stores: Stores, version: ModelVersion) -> PublishedModel:
-    read = stores.artifacts.read_bytes
-    card = json.loads(read(named(version.artifacts, "card.json", version.name).sha256))
-    tensors = load_tensors(read(named(version.artifacts, "model.safetensors", version.name).sha256))
-    return PublishedModel.from_card(tensors, card)

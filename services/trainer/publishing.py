@@ -9,21 +9,22 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from physworld.worldmodel import export
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView
 from physworld_schemas.base import Artifact
-from physworld_schemas.model import TrainingConfig
+from physworld_schemas.model import ModelVersion, TrainingConfig
 from physworld_schemas.signing import SIGNATURE_NAME
 from physworld_services.trainer.measuring import Measured
 from physworld_services.trainer.settings import translate
 from physworld_storage import signing
 from physworld_workers.stores import Stores
-from physworld_workers.tasks.inputs import npz_bytes
+from physworld_workers.tasks.inputs import named, npz_bytes
 
-MANIFEST_NAME = "manifest.json"
+MANIFEST_NAME, WEIGHTS_NAME = "manifest.json", "model.safetensors"
 PROGRAMS = {"torch_export": ("step.pt2", export.torch_program), "onnx": ("step.onnx", export.onnx_program)}
 
 _SEEN = {
@@ -81,6 +82,14 @@ def card_of(
     }
 
 
+def model_of(stores: Stores, version: ModelVersion) -> PublishedModel:
+    """A version as it was published. Raises NotFound, or VersionUnreadable for a layout that is not read here."""
+    read = stores.artifacts.read_bytes
+    card = json.loads(read(named(version.artifacts, "card.json", version.name).sha256))
+    tensors = load_tensors(read(named(version.artifacts, WEIGHTS_NAME, version.name).sha256))
+    return PublishedModel.from_card(tensors, card)
+
+
 def store_version(
     stores: Stores,
     payload: dict[str, Any],
@@ -118,7 +127,7 @@ def store_version(
             put(PROGRAMS[name][1](published.model), PROGRAMS[name][0], "application/octet-stream")
         )
     artifacts = [
-        put(save_tensors(published.to_tensors(), facts), "model.safetensors", "application/octet-stream"),
+        put(save_tensors(published.to_tensors(), facts), WEIGHTS_NAME, "application/octet-stream"),
         *programs,
         put(json.dumps(card, indent=1, allow_nan=False).encode(), "card.json", "application/json"),
         put(npz_bytes(prediction), "prediction.npz", "application/x-npz"),

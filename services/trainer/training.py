@@ -31,16 +31,18 @@ from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
 from physworld.worldmodel.finetune import FineTuneResult, fine_tune
 from physworld.worldmodel.model import config as settings_of
 from physworld.worldmodel.model.conditioning import Conditioning
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, first_episodes, train
-from physworld_schemas.model import TrainingConfig
+from physworld_schemas.base import Reference
+from physworld_schemas.model import ModelVersion, TrainingConfig
 from physworld_schemas.quality import quality_of
 from physworld_services.trainer.closed_loop import closed_loop
 from physworld_services.trainer.episodes import Episodes
 from physworld_services.trainer.measuring import Measured, json_safe, measure
-from physworld_services.trainer.publishing import MANIFEST_NAME, card_of, store_version
+from physworld_services.trainer.publishing import MANIFEST_NAME, card_of, model_of, store_version
 from physworld_services.trainer.settings import translate
-from physworld_storage import traces
+from physworld_storage import registry, traces
 from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
 from physworld_workers.stores import Stores
@@ -80,7 +82,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         {f"{one.name}.{part.name}": part.unit for one in twin.effects for part in type(one).strengths(twin)},
     )
     started = time.perf_counter()
-    trained = _train(context, stores, episodes, view, architecture, training)
+    start = _start(stores, config)
+    network = None if start is None else model_of(stores, start).model
+    trained = _train(context, stores, episodes, view, architecture, training, network)
     training_s = time.perf_counter() - started
     context.begin(FINE_TUNING, "steps", tuning.steps)
     phi = np.zeros((view.spec.object_count, 2))
@@ -116,7 +120,10 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     metrics["fine_tuning"]["strengths"] = json_safe(episodes.tuned(tuned.strengths))
     metrics["closed_loop"] = json_safe(closed_loop(stores, payload, metrics, architecture))
     dataset = episodes.sealed()
-    lineage = lineage_of([dataset, *made_from(stores, payload)], payload["config"], {"training": config.seed})
+    sources = [dataset, *made_from(stores, payload)]
+    if start is not None:
+        sources.append(Reference(kind="model", id=str(config.start_from), digest=start.sha256))
+    lineage = lineage_of(sources, payload["config"], {"training": config.seed})
     card = card_of(payload, config, published, metrics, lineage) | {"trained_on": episodes.description()}
     card["quality"] = quality_of(metrics).model_dump(mode="json")
     artifacts = store_version(
@@ -157,6 +164,15 @@ def _strengths(stores: Stores, payload: dict[str, Any]) -> tuple[StrengthRange, 
     return strength_ranges(trace.effects) if traces.leaves_twin(trace) else ()
 
 
+def _start(stores: Stores, config: TrainingConfig) -> ModelVersion | None:
+    """The version whose network the training goes on from."""
+    if config.start_from is None:
+        return None
+    name, _, number = config.start_from.partition(":")
+    with stores.database.reading() as session:
+        return registry.get_version(session, name, number)
+
+
 def _train(
     context: TaskContext,
     stores: Stores,
@@ -164,6 +180,7 @@ def _train(
     view: SceneView,
     architecture: settings_of.WorldModelConfig,
     training: settings_of.TrainingConfig,
+    start: WorldModel | None,
 ) -> TrainingResult:
     """Train, from the checkpoint of an earlier attempt where there is one."""
     job_id = context.lease.job_id
@@ -206,6 +223,7 @@ def _train(
             validated=validated,
             cancelled=context.cancelled,
             device=device,
+            start=start,
         )
 
     try:

@@ -102,6 +102,7 @@ import torch
 from torch import Tensor, nn
 
 from physworld.arrays import Array
+from physworld.worldmodel.errors import NetworkMismatch
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.features import Normalisation, Scales, vertex_features
 from physworld.worldmodel.model.frame import Turn, enter, leave
@@ -333,6 +334,36 @@ class WorldModel(nn.Module):
         fixed.norm.properties = self.norm.properties[:kept].clone()
         fixed.columns = PROPERTIES
         return fixed
+
+    @torch.no_grad()
+    def take(self, other: WorldModel) -> None:
+        """Go on from the weights of another body's network, which are in units of each body's own scales.
+
+        Shared columns of Φ, and a ground where the other body has none, are not heard at first.
+
+        Raises:
+            NetworkMismatch: the other network has another width, depth or history, or hears what this one does not.
+        """
+        sizes = [
+            (one.config.hidden, one.config.message_passing_steps, one.config.history) for one in (self, other)
+        ]
+        if sizes[0] != sizes[1]:
+            raise NetworkMismatch("width, rounds of messages and history {}; the other has {}".format(*sizes))
+        grounded = other.spec.ground_height_m is not None
+        if other.shared_columns or (grounded and self.spec.ground_height_m is None):
+            heard = [one.name for one in other.shared_columns] + ["the height above a ground"] * grounded
+            raise NetworkMismatch(f"the other network hears {', '.join(heard)}")
+        first = 3 * self.config.history + 3 + len(PROPERTIES)
+        kinds = first + len(self.shared_columns)
+        learned = dict(other.named_parameters())
+        for name, weight in self.named_parameters():
+            theirs = learned[name]
+            if weight.shape == theirs.shape:
+                weight.copy_(theirs)
+                continue
+            weight.zero_()
+            weight[:, :first] = theirs[:, :first]
+            weight[:, kinds : kinds + theirs.shape[1] - first] = theirs[:, first:]
 
     def edge_constants(self) -> EdgeConstants:
         """What of the edge products depends on weights and graph only; valid until the weights change."""

@@ -111,7 +111,7 @@ class LoopJobs(JobKind):
             asked = TrainingCreate(
                 name=model.name,
                 dataset_id=output_of(ended),
-                config=request.training or trained_with(model),
+                config=request.training or trained_with(model).model_copy(update={"start_from": None}),
             )
             training.KIND.open(session, asked, parent=parent)
         else:

@@ -46,16 +46,22 @@ class PipelineJobs(JobKind):
     decisive = ("close_the_loop", "compare")
 
     def open(self, session: Session, request: PipelineCreate) -> JobRow:
-        """The whole chain; its first child, the fit, is opened with it. Raises NotFound."""
+        """The whole chain; its first child, the fit, is opened with it. Raises NotFound, and what ``start_of`` does."""
         scene = required(session, SceneRow, request.scene_id)
         name = request.model_name or model_name_of(scene.name)
+        inputs = [
+            Reference(kind="scene", id=known, digest=required(session, SceneRow, known).digest)
+            for known in (request.scene_id, *request.scene_ids)
+        ]
+        if request.training.start_from is not None:
+            start = training.start_of(session, request.training)
+            inputs.append(start)
+            learning = request.training.model_copy(update={"start_from": start.id})
+            request = request.model_copy(update={"training": learning})
         job = self.queued(
             session,
             total=100,
-            inputs=[
-                Reference(kind="scene", id=known, digest=required(session, SceneRow, known).digest)
-                for known in (request.scene_id, *request.scene_ids)
-            ],
+            inputs=inputs,
             output_id=None,
             config=request.model_copy(update={"model_name": name}).model_dump(mode="json"),
         )

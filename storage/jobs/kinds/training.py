@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from physworld_schemas import queues
 from physworld_schemas.base import Artifact, Reference, Unmade
 from physworld_schemas.job import Job
-from physworld_schemas.model import TrainingCreate
+from physworld_schemas.model import TrainingConfig, TrainingCreate
 from physworld_storage import registry
 from physworld_storage.errors import Conflict
 from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, pending_lineage
@@ -58,15 +58,22 @@ class TrainingJobs(JobKind):
     )
 
     def open(self, session: Session, request: TrainingCreate, parent: JobRow | None = None) -> JobRow:
-        """The next version of a model. Raises NotFound, or Conflict when the dataset is not sealed.
+        """The next version of a model. Raises NotFound, or Conflict when the dataset is not sealed, or when the version
+        that it starts from is not ready or has another network.
 
         With a ``start_share`` below 1 it may still be in the making: the training waits for what it needs.
         """
         dataset = _usable(session, request)
+        inputs = [Reference(kind="dataset", id=dataset.id, digest=dataset.digest)]
+        if request.config.start_from is not None:
+            start = start_of(session, request.config)
+            inputs.append(start)
+            config = request.config.model_copy(update={"start_from": start.id})
+            request = request.model_copy(update={"config": config})
         job = self.queued(
             session,
             total=request.config.steps,
-            inputs=[Reference(kind="dataset", id=dataset.id, digest=dataset.digest)],
+            inputs=inputs,
             output_id=None,
             config=request.model_dump(mode="json"),
             parent=parent,
@@ -124,6 +131,27 @@ class TrainingJobs(JobKind):
 
 
 KIND = TrainingJobs()
+_SIZES = ("hidden", "message_passing_steps", "history")
+
+
+def start_of(session: Session, config: TrainingConfig) -> Reference:
+    """The version, by its number, whose network a training with these settings goes on from.
+
+    Raises NotFound, or Conflict when it is not ready or its network has other sizes.
+    """
+    name, _, version = str(config.start_from).partition(":")
+    row = registry.version_row(session, name, registry.resolve(session, name, version))
+    start = Reference(kind="model", id=registry.reference_id(name, row.version), digest=row.sha256)
+    if row.state != "ready":
+        raise Conflict(
+            f"start_from {start.id} is {row.state}; a training goes on from a version that is ready"
+        )
+    own, other = (
+        {size: getattr(one, size) for size in _SIZES} for one in (config, registry.trained_with(row))
+    )
+    if own != other:
+        raise Conflict(f"the network of start_from {start.id} has {other}; this one has {own}")
+    return start
 
 
 def _version_of(job: JobRow) -> tuple[str, int]:

@@ -8,9 +8,9 @@ import pytest
 
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
-from physworld_schemas.model import TrainingCreate
+from physworld_schemas.model import TrainingConfig, TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_storage import registry, resources
+from physworld_storage import registry, removal, resources
 from physworld_storage.errors import Conflict, NotFound, ResultInvalid
 from physworld_storage.jobs import events as log
 from physworld_storage.jobs import jobs, leases, shards
@@ -53,6 +53,47 @@ def test_a_pipeline_runs_fit_dataset_training_and_publishes(work: Work) -> None:
     assert (version.dataset_id, version.fit_id, version.scene_id) == (dataset.id, fit.id, fit.scene_id)
     assert version.sha256 == "e" * 64
     assert done.outputs[2].id == "soft-beam:1"
+
+
+def _began_from(work: Work, start: str, **sizes: int) -> PipelineCreate:
+    settings = TrainingConfig(start_from=start, **sizes)
+    return PipelineCreate(
+        scene_id=work.scene().id, model_name="other", dataset=DatasetConfig(episodes=1), training=settings
+    )
+
+
+def test_a_pipeline_goes_on_from_a_version_which_stays_until_it_has_ended(work: Work) -> None:
+    work.finish(work.pipeline())
+    with work.database.session() as session:
+        pipeline = jobs.create_pipeline(session, _began_from(work, "soft-beam:latest"))
+    with work.database.session() as session, pytest.raises(Conflict, match="needs version 1 of soft-beam"):
+        removal.remove_version(session, "soft-beam", 1)
+    done = work.finish(pipeline)
+    with work.database.session() as session:
+        version = registry.get_version(session, "other", 1)
+        removal.remove_version(session, "soft-beam", 1)
+    assert version.config.start_from == "soft-beam:1"
+    training = work.job(next(child for child in done.children if work.job(child).kind == "training"))
+    assert ("model", "soft-beam:1", "e" * 64) in {(one.kind, one.id, one.digest) for one in training.inputs}
+
+
+@pytest.mark.parametrize(
+    ("start", "sizes", "error", "says"),
+    [
+        ("soft-beam:1", {"hidden": 32}, Conflict, "has {'hidden': 48, .* this one has {'hidden': 32"),
+        ("soft-beam:2", {}, NotFound, "soft-beam:2"),
+        ("unknown:latest", {}, NotFound, "unknown"),
+        ("begun:1", {}, Conflict, "begun:1 is pending"),
+    ],
+)
+def test_a_start_that_is_none_is_refused_before_the_fit(
+    work: Work, start: str, sizes: dict[str, int], error: type[Exception], says: str
+) -> None:
+    work.finish(work.pipeline())
+    with work.database.session() as session:
+        registry.allot_version(session, "begun", config=TrainingConfig())
+    with work.database.session() as session, pytest.raises(error, match=says):
+        jobs.create_pipeline(session, _began_from(work, start, **sizes))
 
 
 def test_lineage_names_the_inputs_with_their_digests(work: Work) -> None:

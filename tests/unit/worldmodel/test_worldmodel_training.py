@@ -14,10 +14,14 @@ from physworld.worldmodel.dataset import Track, WindowSampler, read_track, split
 from physworld.worldmodel.errors import (
     CheckpointMismatch,
     DatasetUnusable,
+    NetworkMismatch,
     TrainingCancelled,
     TrainingDiverged,
 )
 from physworld.worldmodel.model.config import TrainingConfig
+from physworld.worldmodel.model.features import Normalisation
+from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
 from physworld.worldmodel.rollout import rollout
 from physworld.worldmodel.training import train
 
@@ -58,6 +62,44 @@ def test_the_same_seed_gives_the_same_weights_and_another_one_others(tracks: lis
     assert torch.equal(_weights(first.model), _weights(second.model))
     assert first.validation == second.validation
     assert not torch.equal(_weights(first.model), _weights(other.model))
+
+
+def test_a_training_goes_on_from_another_models_network(tracks: list[Track]) -> None:
+    first = train(tracks, graph(), SMALL, LEARNING)
+    again = train(tracks, graph(), SMALL, SHORT, start=first.model)
+    (_, prior), (_, begun), *_ = again.validation
+    assert prior == pytest.approx(first.prior_error_m, rel=1e-6)
+    assert begun == pytest.approx(first.best_error_m, rel=1e-5)
+    assert again.best_error_m <= begun < prior
+
+
+def test_a_network_of_other_sizes_is_no_start(tracks: list[Track]) -> None:
+    other = WorldModel(dataclasses.replace(SMALL, hidden=8), graph())
+    with pytest.raises(NetworkMismatch, match=r"\(16, 3, 2\); the other has \(8, 3, 2\)"):
+        train(tracks, graph(), SMALL, SHORT, start=other)
+
+
+def test_what_the_other_network_did_not_know_is_not_heard_at_first(tracks: list[Track]) -> None:
+    known = train(tracks, graph(), SMALL, LEARNING).model
+    column = PhiColumn("drag.rate", "1/s", logarithmic=False, shared=True)
+    more = WorldModel(
+        SMALL,
+        graph(ground_height_m=-1.0),
+        Normalisation(properties=(1.0, 1.0, 1.0)),
+        None,
+        (*PROPERTIES, column),
+    )
+    more.take(known)
+    more.norm.load_state_dict(known.norm.state_dict() | {"properties": torch.ones(3)})
+    known.norm.properties.fill_(1.0)
+    n, h = known.spec.object_count, SMALL.history
+    window, ahead = tracks[0].positions[: h + 1, :, None], tracks[0].positions[h + 1, :, None]
+    phi = tracks[0].phi[:, None]
+    shared = torch.full((n, 1, 1), 0.7)
+    told = more(window, ahead, torch.cat([phi, shared], dim=-1))
+    torch.testing.assert_close(told, known(window, ahead, phi))
+    with pytest.raises(NetworkMismatch, match=r"hears drag\.rate, the height above a ground"):
+        known.take(more)
 
 
 def test_a_resumed_training_ends_with_the_same_weights(tracks: list[Track]) -> None:

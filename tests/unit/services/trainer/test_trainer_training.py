@@ -257,6 +257,18 @@ def test_the_same_inputs_give_the_same_weights(runtime: Runtime, dataset_id: str
     assert digests[0] == digests[1]
 
 
+def test_a_training_goes_on_from_a_version(runtime: Runtime, dataset_id: str) -> None:
+    _, first = _train(runtime, dataset_id)
+    _, second = _train(runtime, dataset_id, SMALL.model_copy(update={"start_from": "bar:1"}))
+    assert second.state == "ready" and second.config.start_from == "bar:1"
+    card = json.loads(_files(runtime, second)["card.json"])
+    (start,) = (item for item in card["lineage"]["inputs"] if item["kind"] == "model")
+    assert (start["id"], start["digest"]) == ("bar:1", first.sha256)
+    (prior, begun, *_), before = (one.metrics["validation"]["curve"] for one in (second, first))
+    assert prior == before[0] and begun[0] == 0
+    assert begun[1] == pytest.approx(first.metrics["validation"]["open_loop_m"], rel=1e-5)
+
+
 def test_a_killed_training_carries_on_from_its_checkpoint(
     runtime: Runtime, dataset_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
