@@ -42,6 +42,9 @@ def run(
     hidden: Annotated[int | None, typer.Option(min=8, help="Width of the graph network.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
     vertices: Annotated[int | None, typer.Option(min=4, help="Vertices of the graph.")] = None,
+    start_from: Annotated[
+        str | None, typer.Option(help="Version NAME:VERSION whose network the training goes on from.")
+    ] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     simulations: Annotated[int | None, typer.Option(min=1, help="Most simulations of the fit.")] = None,
     law: Annotated[str | None, typer.Option(help="Elastic law by name, or auto: choose it.")] = None,
@@ -85,6 +88,7 @@ def run(
         "hidden": hidden,
         "steps": steps,
         "vertices": vertices,
+        "start_from": start_from,
     }
     settings |= {"seed": seed, "particle_budget": particles, "max_simulations": simulations}
     settings |= {
