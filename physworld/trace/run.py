@@ -165,8 +165,10 @@ class _Trace:
 
     def run(self) -> TraceResult:
         config, simulations = self.config, self.simulations
-        ground = self._ground()
+        ground = self._ground(self.twin)
         declared = self._declared(ground)
+        ground = self._ground(declared.fitted.twin)
+        declared = self._declared(ground, declared)
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
         lost = self.twin is not self.given
@@ -231,23 +233,23 @@ class _Trace:
             shares=shares,
         )
 
-    def _ground(self) -> _Ground:
+    def _ground(self, twin: Twin) -> _Ground:
         """Noise, what the solver does not know of itself, and the discrepancy that every hypothesis has."""
         simulations = self.simulations
         simulations.stage = "declared physics"
-        simulations.least_step_s = stage_s(self.twin, simulations.drive) / _SLOWEST
-        tracks, answers = simulations.first_look(Job(self.twin, self.frames))
+        simulations.least_step_s = stage_s(twin, simulations.drive) / _SLOWEST
+        tracks, answers = simulations.first_look(Job(twin, self.frames))
         sigma = noise_sigma(self.scene, self.split, tracks)
         scale = sigma or self._rms(tracks) or 1e-3
         bare = whitener(self.scene, self.split, scale, answers)
         simulations.stage = "numerics"
         budget = self.config.calibration.particle_budget
         directions, finer = numerical_directions(
-            simulations, self.lead, self.twin, tracks, budget, self.config.refinement
+            simulations, self.lead, twin, tracks, budget, self.config.refinement
         )
         numerics = {n: float(np.sqrt(np.mean(bare.change(d) ** 2))) for n, d in directions.items()}
         doubt = [_RICHARDSON[n] * d for n, d in directions.items() if n in _RICHARDSON]
-        also = [*self._doubtful(tracks, scale), *doubt]
+        also = [*self._doubtful(twin, tracks, scale), *doubt]
 
         def whitening(answers: Array, tracks: Array) -> Whitener:
             plain, error = whitener(self.scene, self.split, scale, answers), 1.0
@@ -263,13 +265,15 @@ class _Trace:
         blocks = [rows for rows in blocks if len(rows)]
         return _Ground(bare, white, whitening, blocks, sigma, numerics, finer, tracks)
 
-    def _declared(self, ground: _Ground) -> Hypothesis:
+    def _declared(self, ground: _Ground, known: Hypothesis | None = None) -> Hypothesis:
         """The declared physics, begun where the calibration ended too."""
         self.simulations.stage = "declared physics"
         unknowns = self._unknowns()
         setting = self._setting(ground, self.twin, unknowns)
         thorough = replace(setting, iterations=_THOROUGH * self.config.iterations)
         scale = thorough.counted(float(np.mean(ground.white.residual(ground.tracks) ** 2)))
+        if known is not None:
+            return setting.fitted((), known.values, scale=known.unseen.scale) or known
         start = self._beginning()
         places = [place for about in elsewhere(unknowns, start) for place in about]
         places.append(start | {u.name: u.prior[0] for u in hold_unknowns(self.twin) if u.prior})
@@ -357,11 +361,11 @@ class _Trace:
         seen = self.scene.visible[: self.frames]
         return float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames])[seen] ** 2)))
 
-    def _doubtful(self, tracks: Array, sigma: float) -> list[Array]:
+    def _doubtful(self, twin: Twin, tracks: Array, sigma: float) -> list[Array]:
         """What an uncertain start and controllers that err do to the prediction, (frames, N, 3) each."""
         if len(self.recordings.fitted) > 1:
             return []
-        return doubtful(self.simulations, self.lead, self.twin, tracks, sigma)
+        return doubtful(self.simulations, self.lead, twin, tracks, sigma)
 
 
 def _supported(known: list[Hypothesis], weights: Array, sigma: float) -> tuple[Supported, ...]:
