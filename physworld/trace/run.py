@@ -50,6 +50,8 @@ from physworld.twin.twin import Twin
 
 _THOROUGH = 2  # times the iterations of other fits: everything is compared with the declared physics
 _SETTLING = 5  # rounds in turn of an error and of what places and solver take of it
+_PASSES = 5  # fits of the declared physics with the solver's error as the last one has it
+_SETTLED = 0.01  # relative change of the misfit that ends them
 _SLOWEST = 12.0  # times the cost of the declared physics that a run may take: strong friction is dear
 _RICHARDSON = {"finer cells": 2.04, "half the time step": 1.33}  # error over difference, of second order
 
@@ -165,10 +167,7 @@ class _Trace:
 
     def run(self) -> TraceResult:
         config, simulations = self.config, self.simulations
-        ground = self._ground(self.twin)
-        declared = self._declared(ground)
-        ground = self._ground(declared.fitted.twin)
-        declared = self._declared(ground, declared)
+        ground, declared = self._settled()
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
         lost = self.twin is not self.given
@@ -232,6 +231,18 @@ class _Trace:
             supported=_supported(known, weights, ground.white.sigma),
             shares=shares,
         )
+
+    def _settled(self) -> tuple[_Ground, Hypothesis]:
+        """The declared physics where it fits best, and what its solver does not know there: each hangs on the other."""
+        ground = self._ground(self.twin)
+        declared = self._declared(ground)
+        for _ in range(_PASSES):
+            before = declared.fitted.misfit
+            ground = self._ground(declared.fitted.twin)
+            declared = self._declared(ground, declared)
+            if abs(declared.fitted.misfit - before) <= _SETTLED * before:
+                break
+        return ground, declared
 
     def _ground(self, twin: Twin) -> _Ground:
         """Noise, what the solver does not know of itself, and the discrepancy that every hypothesis has."""

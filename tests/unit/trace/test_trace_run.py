@@ -66,6 +66,19 @@ def test_where_nothing_acts_nothing_is_named() -> None:
     assert found.better is None
 
 
+def test_what_the_cells_leave_open_does_not_depend_on_where_the_trace_begins() -> None:
+    scene = recorded(beam(0.03))
+    config = replace(CONFIG, candidates=("air_drag_linear",))
+    near, far = (
+        trace(
+            scene, config, calibrated_twin=build_twin(scene, 120).with_parameters(youngs_modulus_pa=modulus)
+        )
+        for modulus in (YOUNGS_MODULUS_PA, 1.5 * YOUNGS_MODULUS_PA)
+    )
+    assert far.numerics["finer cells"] == pytest.approx(near.numerics["finer cells"], rel=0.1)
+    assert far.declared.fitted.misfit == pytest.approx(near.declared.fitted.misfit, rel=0.04)
+
+
 def test_a_faulty_frame_and_a_marker_that_slips_are_left_out_and_told() -> None:
     scene = recorded(beam(0.03), effect("air_drag_linear", rate_per_s=6.0))
     scene.points[12] += [0.03, 0.0, 0.02]
