@@ -104,12 +104,14 @@ class ViscoelasticMaxwell(Effect):
 
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
-        """A branch up to the size of a stiff law, fading within 5 ms to 5 s."""
+        """A branch up to the size of a stiff law, fading within 5 ms to 5 s; believed to be about as stiff as the law at
+        most, for materials are rarely more than twice as stiff in fast motion as they are slowly."""
         time = Strength("relaxation_s", "s", 5e-3, 5.0, 0.02, gate=False, start=0.1)
         if not isinstance(twin.law, SolidLaw):
-            return (Strength("share", "1", 0.0, 5.0, 0.02), time)
-        scale = twin.density * gravity_size(twin) * body_size(twin)
-        return (Strength("shear_modulus_pa", "Pa", 0.0, 1e4 * scale, 0.02 * twin.law.lame[0]), time)
+            return (Strength("share", "1", 0.0, 5.0, 0.02, prior_deviation=1.0), time)
+        scale, shear = twin.density * gravity_size(twin) * body_size(twin), twin.law.lame[0]
+        own = Strength("shear_modulus_pa", "Pa", 0.0, 1e4 * scale, 0.02 * shear, prior_deviation=shear)
+        return (own, time)
 
     @classmethod
     def variants(cls, twin: Twin) -> list[Variant]:
