@@ -104,8 +104,11 @@ class ViscoelasticMaxwell(Effect):
 
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
-        """A branch up to the size of a stiff law, fading within 5 ms to 5 s; believed to be about as stiff as the law at
-        most, for materials are rarely more than twice as stiff in fast motion as they are slowly."""
+        """A branch up to the size of a stiff law, fading within 5 ms to 5 s.
+
+        It is believed to be about as stiff as the law at most: few materials are more than twice as stiff in fast motion
+        as in slow one.
+        """
         time = Strength("relaxation_s", "s", 5e-3, 5.0, 0.02, gate=False, start=0.1)
         if not isinstance(twin.law, SolidLaw):
             return (Strength("share", "1", 0.0, 5.0, 0.02, prior_deviation=1.0), time)
