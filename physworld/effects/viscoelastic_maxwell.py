@@ -106,8 +106,8 @@ class ViscoelasticMaxwell(Effect):
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """A branch up to the size of a stiff law, fading within 5 ms to 5 s.
 
-        It is believed to be about as stiff as the law at most: few materials are more than twice as stiff in fast motion
-        as in slow one.
+        It is believed to be about as stiff as the law at most: few materials are more than twice as stiff in fast
+        motion as in slow motion.
         """
         time = Strength("relaxation_s", "s", 5e-3, 5.0, 0.02, gate=False, start=0.1)
         if not isinstance(twin.law, SolidLaw):

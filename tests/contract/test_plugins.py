@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 TESTS = Path(__file__).resolve().parents[1]
 INIT = '"""Not imported where only the catalogue is read."""\n'
 LAW = '''

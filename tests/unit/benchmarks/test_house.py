@@ -16,6 +16,8 @@ from benchmarks.house import (
     wants_args,
 )
 
+pytestmark = pytest.mark.slow
+
 MODULE = '''
 Json = Annotated[bool, typer.Option(help="As JSON.")]
 

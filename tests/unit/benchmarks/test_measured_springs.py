@@ -15,6 +15,8 @@ from physworld.baselines.spring_fit import SpringModel, SpringSettings
 from physworld_scenes.bundle import write_bundle
 from tests.tiny_scene import tiny_scene
 
+pytestmark = pytest.mark.slow
+
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> dict[str, object]:
     monkeypatch.setattr("sys.argv", ["springs", *arguments])

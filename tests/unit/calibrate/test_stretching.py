@@ -17,6 +17,8 @@ from physworld.calibrate.taut import taut_starts
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 LENGTH, RADIUS, FRAMES = 0.4, 0.006, 40
 BODY = Body(length_m=LENGTH, radius_m=RADIUS, density_kg_m3=900.0)
 

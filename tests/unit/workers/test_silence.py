@@ -29,6 +29,8 @@ from physworld_workers.dispatcher import Dispatcher
 from physworld_workers.errors import LeaseLost
 from physworld_workers.stores import Stores
 
+pytestmark = pytest.mark.slow
+
 WITHIN_S = 25.0
 SHORT = Patience(
     connect_s=2,

@@ -34,6 +34,8 @@ from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.owner import process_owner
 from physworld_workers.stores import Stores
 
+pytestmark = pytest.mark.slow
+
 WITHIN_S = 30.0
 LEASE_S = 4.0
 SHORT = Patience(

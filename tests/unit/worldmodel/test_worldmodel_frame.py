@@ -22,6 +22,8 @@ from physworld.worldmodel.priors.choose import TURNED, choose, fit_priors, prior
 from physworld.worldmodel.rollout import rollout
 from physworld.worldmodel.training import train
 
+pytestmark = pytest.mark.slow
+
 GRAVITY = np.array([0.0, 0.0, -9.81])
 SHAPES = {
     "in space": np.random.default_rng(0).normal(size=(8, 3)),
