@@ -20,6 +20,8 @@ import jsonschema
 import pytest
 import yaml
 
+pytestmark = pytest.mark.slow
+
 SECRETS = (
     "POSTGRES_PASSWORD",
     "BROKER_PASSWORD",

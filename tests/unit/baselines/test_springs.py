@@ -17,6 +17,8 @@ from physworld.errors import SceneUnsupported, SimulationError
 from physworld.scene import DeclaredCollider, Scene
 from tests.tiny_scene import tiny_scene
 
+pytestmark = pytest.mark.slow
+
 SMALL = SpringSettings(points=60, population=6, generations=6, epochs=6)
 
 

@@ -21,6 +21,8 @@ from physworld.camera import look_at
 from physworld.video import Renderer, SplatConfig, SplatView, eight_bit, gaussians_at_points
 from physworld_scenes.bundle import checked
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 12
 SETTINGS = Settings(
     frames=FRAMES,

@@ -13,6 +13,8 @@ from benchmarks.trace.power_effects import inject
 from benchmarks.trace.power_objects import OBJECTS, observed
 from physworld.effects.registry import EFFECTS
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_registry_holds_them_for_a_recording_only() -> None:
     before = list(EFFECTS)

@@ -16,6 +16,8 @@ from physworld.twin.build import build_twin
 from physworld.twin.rods import first_mode
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 LENGTH, FRAMES, POINTS = 0.6, 50, 7
 ROLL = 2.0  # rad by which the rope is rolled in the second recording
 

@@ -9,6 +9,8 @@ from physworld.engine.lattice.lattice import box_lattice, lattice_from_cells
 from physworld.engine.terms.contact import contact_points
 from physworld.geometry.filling import filled_body
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_points_of_a_full_box_cover_its_faces() -> None:
     low, size = np.array([0.1, 0.0, -0.2]), np.array([0.3, 0.2, 0.1])

@@ -20,6 +20,8 @@ from physworld.materials.rod import RodLaw
 from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw
 from physworld.materials.solid import SolidLaw
 
+pytestmark = pytest.mark.slow
+
 TOLERANCE = {3: 1e-3, 2: 1e-6, 1: 1e-6}  # of the largest entry: solids' forces are rounded to float32
 STEP = {3: 2e-5, 2: 1e-7, 1: 1e-7}  # [m] of the differences
 DT = 2e-4

@@ -10,6 +10,8 @@ from physworld.planning.goals import GoalPoints
 from physworld.planning.mppi import MppiConfig, search
 from physworld.planning.task import PlanningTask
 
+pytestmark = pytest.mark.slow
+
 HORIZON = 20
 
 
