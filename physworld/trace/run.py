@@ -277,7 +277,7 @@ class _Trace:
         return _Ground(bare, white, whitening, blocks, sigma, numerics, finer, tracks)
 
     def _declared(self, ground: _Ground, known: Hypothesis | None = None) -> Hypothesis:
-        """The declared physics, begun where the calibration ended too."""
+        """The declared physics, begun where it is ``known`` to fit, else about where the calibration ended too."""
         self.simulations.stage = "declared physics"
         unknowns = self._unknowns()
         setting = self._setting(ground, self.twin, unknowns)

@@ -92,7 +92,7 @@ def test_what_the_other_network_did_not_know_is_not_heard_at_first(tracks: list[
     more.take(known)
     more.norm.load_state_dict(known.norm.state_dict() | {"properties": torch.ones(3)})
     known.norm.properties.fill_(1.0)
-    n, h = known.spec.object_count, SMALL.history
+    h = SMALL.history
     window, ahead = tracks[0].positions[: h + 1, :, None], tracks[0].positions[h + 1, :, None]
     phi = tracks[0].phi[:, None]
     shared = torch.full((n, 1, 1), 0.7)
