@@ -95,7 +95,7 @@ def test_what_the_other_network_did_not_know_is_not_heard_at_first(tracks: list[
     h = SMALL.history
     window, ahead = tracks[0].positions[: h + 1, :, None], tracks[0].positions[h + 1, :, None]
     phi = tracks[0].phi[:, None]
-    shared = torch.full((n, 1, 1), 0.7)
+    shared = torch.full((len(phi), 1, 1), 0.7)
     told = more(window, ahead, torch.cat([phi, shared], dim=-1))
     torch.testing.assert_close(told, known(window, ahead, phi))
     with pytest.raises(NetworkMismatch, match=r"hears drag\.rate, the height above a ground"):
