@@ -163,7 +163,8 @@ def test_a_cancelled_trace_stops_at_its_next_simulation(
 def test_a_trace_whose_time_is_up_calls_off_what_it_has_asked_for(
     runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    limited = SMALL.model_copy(update={"time_limit_s": 3600.0})
+    # with a noise below what the model errs there is something to search for
+    limited = SMALL.model_copy(update={"time_limit_s": 3600.0, "noise_m": 1e-6})
     with stores.database.session() as session:
         job = jobs.create_trace(session, TraceCreate(scene_id=scene_id, fit=FIT, config=limited))
     (driver,) = _waiting(stores)
