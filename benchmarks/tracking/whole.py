@@ -26,7 +26,12 @@ from physworld.trace import TraceConfig, trace
 
 EXACT_NOISE_M = 1e-4
 """Of exact tracks: what the lattice of a fit leaves of them."""
-STIFFNESS = {"beam": "youngs_modulus_pa", "sheet": "youngs_modulus_pa", "rope": "bending_n_m2"}
+STIFFNESS = {
+    "beam": "youngs_modulus_pa",
+    "sheet": "youngs_modulus_pa",
+    "rope": "bending_n_m2",
+    "toy": "youngs_modulus_pa",
+}
 
 
 def whole_way(folder: Path, particles: int, exact_too: bool = True) -> dict[str, Any]:
