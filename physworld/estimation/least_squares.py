@@ -52,8 +52,8 @@ def descent(theta: Array, low: Array, high: Array, steps: Array, max_iterations:
     Yields places that do not depend on each other and those that it will likely ask for next, is sent the residuals of
     the former, in their order, and returns the solution.
 
-    A residual that is not finite is a failed simulation: the step is shortened. One run per parameter and Jacobian,
-    one per trial step; ``max_iterations`` Jacobians at most.
+    A residual that is not finite is a failed simulation: the step is shortened; at the start it is what is returned.
+    One run per parameter and Jacobian, one per trial step; ``max_iterations`` Jacobians at most.
 
     Args:
         theta: start, (p,).
@@ -66,7 +66,7 @@ def descent(theta: Array, low: Array, high: Array, steps: Array, max_iterations:
     cost = float(np.mean(now**2))
     damping = 1e-3
     jacobian = np.zeros((len(now), len(theta)))
-    for left in reversed(range(max_iterations)):
+    for left in reversed(range(max_iterations if np.isfinite(cost) else 0)):
         probes = probes_of(theta, high, steps)
         jacobian = differences(theta, now, steps, probes, (yield probes, []))
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ now

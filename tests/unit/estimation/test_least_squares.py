@@ -41,6 +41,18 @@ def test_a_quadratic_is_solved_and_its_cost_is_the_rest() -> None:
     np.testing.assert_allclose(found.jacobian[:, 1], [-1.5, -0.5, 0.5, 1.5], atol=1e-9)
 
 
+def test_a_start_that_cannot_be_simulated_is_returned_and_nothing_else_is_tried() -> None:
+    visited: list[np.ndarray] = []
+
+    def blown_up(theta: np.ndarray) -> np.ndarray:
+        visited.append(theta)
+        return np.full(4, np.nan)
+
+    found = gauss_newton(blown_up, np.array([0.5, 0.25]), LOW, HIGH, STEPS, 8)
+    np.testing.assert_array_equal(found.theta, [0.5, 0.25])
+    assert np.isnan(found.cost) and len(visited) == 1
+
+
 def test_a_curved_basin_is_followed() -> None:
     def rosenbrock(theta: np.ndarray) -> np.ndarray:
         return np.array([10 * (theta[1] - theta[0] ** 2), 1 - theta[0]])
