@@ -185,7 +185,15 @@ class Search:
         distinct = [
             s for k, s in enumerate(early) if k == 0 or np.abs(s.theta - early[0].theta).max() > _DISTINCT
         ]
-        return min(self.solve_each([Descent(parameters, s.theta, 5) for s in distinct[:2]]), key=cost_of)
+        late = min(self.solve_each([Descent(parameters, s.theta, 5) for s in distinct[:2]]), key=cost_of)
+        if not (np.isfinite(late.cost) or self.cut_short):
+            first = parameters[0]
+            raise CalibrationError(
+                f"{len(usable)} of {len(starts)} starts gave a usable simulation to frame {window - 1}, the best of "
+                f"them none to frame {self.end - 1}, where the training ends: one failed at {first.name} "
+                f"{first.value(float(late.theta[0])):.3g} {first.unit}"
+            )
+        return late
 
     def _usable(
         self, name: str, parameters: list[Parameter], starts: list[Array], end: int

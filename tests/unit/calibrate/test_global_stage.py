@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from made_scene import box_body, made_scene, recorded_by
 from physworld.calibrate import CalibrationConfig, Journal, calibrate
 from physworld.calibrate.search import Search
 from physworld.errors import CalibrationError, Cancelled, SceneUnsupported
+from physworld.estimation.simulations import Drive, Job, in_turn
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
@@ -162,6 +164,21 @@ def test_a_cancelled_calibration_stops_in_the_middle_of_a_run(undamped: Scene) -
     asked = iter([False] * 5 + [True])
     with pytest.raises(Cancelled, match="after 0 runs"):  # at its sixth frame
         calibrate(undamped, CONFIG, cancelled=lambda: next(asked))
+
+
+def test_a_body_that_can_be_simulated_for_a_while_only_is_refused(undamped: Scene) -> None:
+    """Every start is usable on the first frames, and none is on all of them."""
+
+    def failing_late(
+        jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
+    ) -> Iterator[np.ndarray | None]:
+        for job, tracks in zip(jobs, in_turn(jobs, drive, poll), strict=True):
+            yield None if job.frames == undamped.train[1] else tracks
+
+    with pytest.raises(
+        CalibrationError, match=r"starts gave a usable simulation to frame \d+, .* to frame 27"
+    ):
+        calibrate(undamped, CONFIG, runner=failing_late)
 
 
 def test_training_frames_without_a_sighting_are_refused(undamped: Scene) -> None:
