@@ -28,7 +28,7 @@ SOFT_LOG, SOFT_WIDTH = -1.2, 0.18
 """Of the uneven bar: logarithm of its modulus in the middle over the ends', deviation of the dip over its length."""
 CLOTH_SIZE_M, CLOTH_THICK_M, CLOTH_DENSITY_KG_M3, CLOTH_PA = (0.25, 0.27), 0.0045, 370.0, 2e5
 CLAMPED_CELLS, CLAMPED_M, CLOTH_POISSON = (12, 18), 0.03, 0.3
-TOY_PA, TOY_DENSITY_KG_M3, TOY_HELD_M = 1.2e5, 900.0, 0.04
+TOY_PA, TOY_ELEMENTS, TOY_DENSITY_KG_M3, TOY_HELD_M = 3e5, (18, 3, 3), 900.0, 0.04
 MARKER_SIDE_M = 0.05
 """Of the marker itself; the plate that it is printed on is a fifth wider on every side."""
 MARKER_ID = 7
@@ -315,14 +315,14 @@ def toy(frames: int = FRAMES) -> Play:
     def shape(unit: Array) -> Array:
         along, square = unit[:, 0], 2.0 * unit[:, 1:] - 1.0
         disc = square * np.sqrt(1.0 - 0.3 * square[:, ::-1] ** 2)  # a square with round corners
-        radius = 0.024 + 0.01 * np.cos(2.0 * np.pi * along)
+        radius = 0.027 + 0.006 * np.cos(2.0 * np.pi * along)
         arch = 0.03 * np.sin(np.pi * along)
         low = make_sample_scene.Recipe().corner_m
         return np.stack(
             [low[0] + 0.24 * along, radius * disc[:, 0], 0.5 + arch + radius * disc[:, 1]], axis=1
         )
 
-    elements = Elements((9, 2, 2), shape, TOY_PA, 0.35, TOY_DENSITY_KG_M3)
+    elements = Elements(TOY_ELEMENTS, shape, TOY_PA, 0.35, TOY_DENSITY_KG_M3)
     end = float(elements.nodes[:, 0].min()) + TOY_HELD_M
     held = np.flatnonzero(elements.nodes[:, 0] <= end + 1e-9)
     path = record(elements, Acting(), [(held, make_sample_scene.grip_pose)], np.arange(frames) / FPS)

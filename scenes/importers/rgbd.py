@@ -21,6 +21,7 @@ from physworld.errors import TrackingFailed
 from physworld.scene import Scene, sigma_of
 from physworld.tracking.agreement import WARNED_APART_M
 from physworld.tracking.ground import Plane
+from physworld.tracking.hidden_side import body_of_seen_side
 from physworld.tracking.middle import onto_middle
 from physworld.tracking.noise import sighting_covariances
 from physworld.tracking.places import TrackConfig
@@ -37,6 +38,7 @@ from physworld_scenes.importers.upright import upright
 
 DEFAULT_KIND, DEFAULT_FPS = "blob", 30.0
 ROD_KINDS, SHEET_KINDS = ("rope", "rod", "branched_rope"), ("sheet", "cloth")
+SLENDER_KINDS = ("arm", "trunk")
 GROUND_NEAR_M = 0.05
 """From the object's lowest point: a ground that is farther away is none of the scene."""
 UNSEEN_WARNING = 0.1
@@ -185,6 +187,20 @@ def _cameras(masks: Masks, followed: Followed) -> dict[str, Any]:
     }
 
 
+def _filled(options: ImportOptions, followed: Followed, warnings: list[str]) -> Array | None:
+    """Points (M, 3) [m] that fill a solid whose shape nobody declares, with its far side as the seen one."""
+    kind = options.kind or DEFAULT_KIND
+    if kind in ROD_KINDS + SHEET_KINDS + SLENDER_KINDS or "box_min_m" in options.body:
+        return None
+    found = body_of_seen_side(followed.views, followed.masks)
+    if found is not None:
+        warnings.append(
+            f"no camera sees the far side of the body, {1e2 * np.ptp(found, axis=0).round(3)} cm along x, y and z: it "
+            "is taken as a mirror image of the seen one; declare its box, or give rest_volume_points, if you know them"
+        )
+    return found
+
+
 def mask_file(path: Path | None, camera: Camera) -> Array | None:
     from PIL import Image
 
@@ -266,6 +282,8 @@ def _parts(
         arrays["noise_covariance"] = covariances
     if len(errors):
         arrays["controller_errors"] = errors
+    if (filled := _filled(options, followed, warnings)) is not None:
+        arrays["rest_volume_points"] = filled
     if path is not None and (missing := 1.0 - float(path.seen.mean())) > UNSEEN_WARNING:
         warnings.append(f"the gripper is not seen in {missing:.0%} of the frames, where it is interpolated")
     return declared, arrays

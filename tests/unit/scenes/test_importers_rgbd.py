@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from tracking_pictured import BOTTOM, FRAMES, LEFT, RIGHT, TOP, write
 
+from physworld.tracking.view import Box
 from physworld.video import Renderer, from_ply
 from physworld_scenes.bundle import read_bundle
 from physworld_scenes.errors import SceneInvalid
+from physworld_scenes.importers.options import ImportOptions
 from physworld_scenes.importers.pictures import is_pictures, read_pictures
+from physworld_scenes.importers.rgbd import PictureOptions, read_folder
 from physworld_workers.commands import importing
 from physworld_workers.commands.video import camera_in
 
@@ -42,7 +45,7 @@ def test_the_command_writes_a_scene_with_z_up(folder: Path, tmp_path: Path) -> N
     assert np.allclose(scene.points[scene.visible][:, 1], 0.5, atol=2e-3)
     assert np.ptp(scene.points[0, :, 2]) > 0.05
     assert scene.controllers.shape == (FRAMES, 8, 3) and len(scene.grips) == 1
-    assert len(scene.surface_points) > 100 and picture.is_file()
+    assert scene.surface_points is not None and len(scene.surface_points) > 100 and picture.is_file()
     # the splat lies where the scene does and shows what the camera saw
     splat = from_ply((tmp_path / "pictures/splat.ply").read_bytes())
     assert np.abs(splat.means[:, 1] - 0.5).mean() < 5e-3
@@ -54,6 +57,25 @@ def test_the_command_writes_a_scene_with_z_up(folder: Path, tmp_path: Path) -> N
     inside = np.s_[TOP + 4 : BOTTOM - 4, LEFT + 4 : RIGHT - 4]
     assert (seen.alpha[inside] > 0.5).mean() > 0.98
     assert np.mean((seen.rgb[inside] - frames[0][inside] / 255.0) ** 2) < 10**-2.5  # a PSNR of 25 dB
+
+
+def test_a_solid_without_a_declared_shape_is_filled_to_a_far_side_that_nothing_measures(
+    tmp_path: Path,
+) -> None:
+    radius = 0.05
+    write(tmp_path / "cylinder", round_m=radius)
+    box = Box(LEFT - 8, TOP - 8, RIGHT + 8, BOTTOM + 8)
+    given = PictureOptions(boxes={0: box}, up="-y", points=40)
+    scene, warnings, _ = read_folder(tmp_path / "cylinder", ImportOptions(kind="blob", fps=30.0), given)
+    volume = scene.rest_volume_points
+    assert volume is not None and np.isclose(np.ptp(volume[:, 1]), 2 * radius, rtol=0.15)
+    assert scene.surface_points is not None and np.ptp(scene.surface_points[:, 1]) < 1.1 * radius
+    assert any("no camera sees the far side" in line and "mirror image" in line for line in warnings)
+    declared = ImportOptions(
+        kind="blob", fps=30.0, body={"box_min_m": [-0.08, 0.5, -0.06], "box_max_m": [0.08, 0.6, 0.06]}
+    )
+    scene, warnings, _ = read_folder(tmp_path / "cylinder", declared, given)
+    assert scene.rest_volume_points is None and not any("far side" in line for line in warnings)
 
 
 def test_without_a_box_it_says_what_is_missing(
