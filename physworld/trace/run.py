@@ -52,7 +52,7 @@ _THOROUGH = 2  # times the iterations of other fits: everything is compared with
 _SETTLING = 5  # rounds in turn of an error and of what places and solver take of it
 _PASSES = 5  # fits of the declared physics with the solver's error as the last one has it
 _SETTLED = 0.01  # relative change of the misfit that ends them
-_SLOWEST = 12.0  # times the cost of the declared physics that a run may take: strong friction is dear
+_SLOWEST = 50.0  # times the cost of the declared physics that a run may take: strong friction is dear
 _RICHARDSON = {"finer cells": 2.04, "half the time step": 1.33}  # error over difference, of second order
 
 

@@ -3,7 +3,8 @@
 Every candidate is scored to first order first (:mod:`physworld.trace.screening`). The most promising are fitted with
 the full simulator from the best of their near starts (:mod:`physworld.trace.starts`). Where one of them comes near the
 noise, the stiffness that it has found is right and no other basin is looked for. Where none does, all are begun far
-away too.
+away too. What is strong promises little to first order: beside the material of the best of these fits the strengths of
+all others are tried over their range.
 
 Then another effect is added to the best set as long as the last one removed what one of two would, at most three; of
 every larger set each effect is taken out again and exchanged, from the larger set's basin, so that a pair whose first
@@ -158,6 +159,8 @@ class Search:
         if not base.members and not any(_near(known) for known in [base, *self._of_size(size)]):
             self._begin(base, order, far=True)
         self._settle(size)
+        if self._scan(base, scores):
+            self._settle(size)
 
     def _worth(self, base: Hypothesis, scores: Sequence[Screened], count: int) -> list[list[Screened]]:
         """The variants of the effects that are asked beside ``base``, the most promising first: of every effect where
@@ -190,6 +193,25 @@ class Search:
             if scores or one.promised >= _HALF * most > 0.0 or _near(base):
                 self.setting.simulations.stage = f"fit with {one.screened.candidate.effect}"
                 self._fit(base, one)
+
+    def _scan(self, base: Hypothesis, scores: Sequence[Screened]) -> bool:
+        """Fits what promised too little beside a wrong material and does beside that of the best fit; whether any."""
+        best = min(self._of_size(len(base.members) + 1), key=lambda h: h.left, default=None)
+        if best is None or _near(base) or self._removes(base, best) < MOST:
+            return False
+        wanted = _HALF * self.starts.promised(base, best)
+        missing: dict[str, list[Begun]] = {}
+        for one in scores:
+            if _names((*base.members, one.candidate)) not in self.hypotheses:
+                self.setting.simulations.stage = f"fit with {one.candidate.effect}"
+                tried = missing.setdefault(one.candidate.effect, [])
+                if len(tried) < _VARIANTS:
+                    tried.append(self.starts.scanned(base, one, best))
+        begun = [max(tried, key=lambda known: known.promised) for tried in missing.values()]
+        chosen = [known for known in begun if known.promised >= wanted]
+        for choice in chosen:
+            self._fit(base, choice)
+        return bool(chosen)
 
     def _begun(self, base: Hypothesis, variants: list[Screened], far: bool) -> Begun:
         """Where the fit of an effect begins: of its best variants the one that promises most."""

@@ -2,8 +2,9 @@
 
 *Near* starts are the linear estimate of the strengths, multiples of it (a strength is underestimated where motion has
 run out of phase), and both where other hypotheses have come to rest (their *basins*). *Far* starts are estimates of the
-strengths beside other stiffnesses. All are ranked on the first part of the recording, where phases have not slipped
-yet; the best of the far ones are first fitted to that part.
+strengths beside other stiffnesses. *Scanned* ones are shares of the strengths' range beside the material of the best
+hypothesis, for what is strong says little of itself to first order. All are ranked on the first part of the recording,
+where phases have not slipped yet; the best of the far ones are first fitted to that part.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from physworld.trace.screening import Screened
 
 _EARLY = 0.4  # share of the training frames on which starts are ranked
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
-_SCANNED = (0.3, 0.1, 0.03, 0.01)  # of a strength's range, beside the numbers of the calibration
+_SCANNED = (1.0, 0.3, 0.1, 0.03, 0.01)  # of a strength's range, beside known numbers
 _PROFILE = (
     5,
     2,
@@ -87,6 +88,13 @@ class Starts:
         best = [order[j] for j in distinct([places[k][first] for k in order])][:_FOLLOWED]
         return Begun(one, [_named(unknowns, places[k]) for k in best], self._promised(base, min(errors)))
 
+    def scanned(self, base: Hypothesis, one: Screened, known: Hypothesis) -> Begun:
+        """The best of the scanned starts with the calibrated numbers of a hypothesis that is fitted."""
+        starts = self._scan(base, one, known.values)
+        unknowns, places, errors = self._ranked(base, one, starts)
+        best = int(np.argmin(errors))
+        return Begun(one, [_named(unknowns, places[best])], self._promised(base, errors[best]))
+
     def followed(self, base: Hypothesis, begun: Begun, every: bool) -> Begun:
         """Fits to the early frames from these starts, or from the first alone."""
         starts = begun.starts if every else begun.starts[:1]
@@ -139,11 +147,16 @@ class Starts:
             ]
         if not self.calibrated:
             return starts
-        # there, what is estimated elsewhere only has a direction
-        kept = {n: v for n, v in self.calibrated.items() if n in base.values}
+        return starts + self._scan(base, one, self.calibrated)
+
+    def _scan(self, base: Hypothesis, one: Screened, numbers: Values) -> list[Values]:
+        """Shares of the strengths' range beside other calibrated numbers, where what was estimated elsewhere only has a
+        direction."""
+        kept = {n: v for n, v in numbers.items() if n in base.values}
         ranges = {u.name: max(abs(end) for end in u.bounds) for u in one.candidate.unknowns()}
+        strengths = {n: one.values[n] for n in ranges}
         largest = max((abs(s) / ranges[n] for n, s in strengths.items()), default=1.0) or 1.0
-        return starts + [
+        return [
             {**base.values, **kept, **{n: share / largest * s for n, s in strengths.items()}}
             for share in _SCANNED
         ]
