@@ -39,6 +39,8 @@ from physworld_scenes.importers.upright import upright
 DEFAULT_KIND, DEFAULT_FPS = "blob", 30.0
 ROD_KINDS, SHEET_KINDS = ("rope", "rod", "branched_rope"), ("sheet", "cloth")
 SLENDER_KINDS = ("arm", "trunk")
+LEAST_FILLING = 20
+"""Points that fill a body: with fewer its cloud tells more."""
 GROUND_NEAR_M = 0.05
 """From the object's lowest point: a ground that is farther away is none of the scene."""
 UNSEEN_WARNING = 0.1
@@ -187,17 +189,23 @@ def _cameras(masks: Masks, followed: Followed) -> dict[str, Any]:
     }
 
 
-def _filled(options: ImportOptions, followed: Followed, warnings: list[str]) -> Array | None:
-    """Points (M, 3) [m] that fill a solid whose shape nobody declares, with its far side as the seen one."""
+def _filled(
+    options: ImportOptions, followed: Followed, ground: Plane | None, warnings: list[str]
+) -> Array | None:
+    """Points (M, 3) [m] above the ground that fill a solid of undeclared shape, its far side as the near one."""
     kind = options.kind or DEFAULT_KIND
     if kind in ROD_KINDS + SHEET_KINDS + SLENDER_KINDS or "box_min_m" in options.body:
         return None
     found = body_of_seen_side(followed.views, followed.masks)
-    if found is not None:
-        warnings.append(
-            f"no camera sees the far side of the body, {1e2 * np.ptp(found, axis=0).round(3)} cm along x, y and z: it "
-            "is taken as a mirror image of the seen one; declare its box, or give rest_volume_points, if you know them"
-        )
+    if found is not None and ground is not None:
+        found = found[found[:, 2] >= ground.height]
+    if found is None or len(found) < LEAST_FILLING:
+        return None
+    size = " x ".join(f"{1e2 * side:.1f}" for side in np.ptp(found, axis=0))
+    warnings.append(
+        f"no camera sees the far side of the body, which is taken as a mirror image of the seen one: {size} cm along "
+        "x, y and z; declare its box, or give rest_volume_points, if you know them"
+    )
     return found
 
 
@@ -282,7 +290,7 @@ def _parts(
         arrays["noise_covariance"] = covariances
     if len(errors):
         arrays["controller_errors"] = errors
-    if (filled := _filled(options, followed, warnings)) is not None:
+    if (filled := _filled(options, followed, ground, warnings)) is not None:
         arrays["rest_volume_points"] = filled
     if path is not None and (missing := 1.0 - float(path.seen.mean())) > UNSEEN_WARNING:
         warnings.append(f"the gripper is not seen in {missing:.0%} of the frames, where it is interpolated")

@@ -6,18 +6,22 @@ import json
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from tracking_pictured import BOTTOM, FRAMES, LEFT, RIGHT, TOP, write
 
+from physworld.tracking.ground import Plane
 from physworld.tracking.view import Box
 from physworld.video import Renderer, from_ply
 from physworld_scenes.bundle import read_bundle
 from physworld_scenes.errors import SceneInvalid
+from physworld_scenes.importers import rgbd
 from physworld_scenes.importers.options import ImportOptions
 from physworld_scenes.importers.pictures import is_pictures, read_pictures
 from physworld_scenes.importers.rgbd import PictureOptions, read_folder
+from physworld_scenes.importers.upright import upright
 from physworld_workers.commands import importing
 from physworld_workers.commands.video import camera_in
 
@@ -76,6 +80,21 @@ def test_a_solid_without_a_declared_shape_is_filled_to_a_far_side_that_nothing_m
     )
     scene, warnings, _ = read_folder(tmp_path / "cylinder", declared, given)
     assert scene.rest_volume_points is None and not any("far side" in line for line in warnings)
+
+
+def test_a_guessed_far_side_ends_at_the_ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "cylinder", round_m=0.05)
+    given = PictureOptions(boxes={0: Box(LEFT - 8, TOP - 8, RIGHT + 8, BOTTOM + 8)}, up="-y", points=40)
+    lowest = -0.02
+
+    def over_ground(*told: Any) -> Any:
+        recording, _, how = upright(*told)
+        return recording, Plane(np.array([0.0, 0.0, 1.0]), lowest, 0.5, 1e-3), how
+
+    monkeypatch.setattr(rgbd, "upright", over_ground)
+    scene, _, _ = read_folder(tmp_path / "cylinder", ImportOptions(kind="blob", fps=30.0), given)
+    volume = scene.rest_volume_points
+    assert volume is not None and lowest <= volume[:, 2].min() < lowest + 0.01
 
 
 def test_without_a_box_it_says_what_is_missing(
