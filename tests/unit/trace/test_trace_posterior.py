@@ -13,7 +13,9 @@ from physworld.estimation.left_out import LeftOut
 from physworld.trace.answer import decided
 from physworld.trace.candidates import Candidate
 from physworld.trace.posterior import posterior, removes
+from physworld.trace.screening import Screened
 from physworld.trace.search import Search
+from physworld.trace.starts import Begun
 
 BLOCKS, ROWS = 5, 12
 
@@ -73,6 +75,40 @@ def test_without_a_candidate_that_makes_sense_the_declared_physics_has_everythin
     search.hypotheses[()] = declared
     assert search.library == 0
     np.testing.assert_array_equal(search.weights(), [1.0])
+
+
+@pytest.mark.parametrize(
+    ("declared", "fitted"), [(5.0, [("air_drag_quadratic", "along"), ("tether", "z")]), (1.1, [])]
+)
+def test_what_promises_little_at_first_is_tried_beside_the_material_of_the_best(
+    declared: float, fitted: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Strong effects promise little to first order. Where the declared physics comes near the noise they do not lie."""
+    promises = {"along": 0.6, "x": 0.1, "z": 0.5, "": 0.2}
+    scores: list[Any] = [
+        Screened(Candidate(name, label, ()), {}, 0.05, 1.0)
+        for name, label in (("air_drag_quadratic", "along"), ("tether", "x"), ("tether", "z"), ("swirl", ""))
+    ]
+    best: Any = SimpleNamespace(members=(Candidate("air_drag_linear", "", ()),), left=1.3)
+    beside: list[Any] = []
+
+    def scanned(base: Any, one: Screened, known: Any) -> Begun:
+        beside.append(known)
+        return Begun(one, [{}], promises[one.candidate.variant])
+
+    starts: Any = SimpleNamespace(promised=lambda base, known: 0.9, scanned=scanned)
+    setting: Any = SimpleNamespace(simulations=SimpleNamespace(stage=""))
+    search = Search(setting, [], starts, 1, 1, 1)
+    base: Any = SimpleNamespace(members=(), left=declared, fitted=SimpleNamespace(misfit=declared**0.5))
+    search.hypotheses |= {(): base, ("air_drag_linear",): best}
+    begun: list[tuple[str, str]] = []
+    monkeypatch.setattr(
+        search,
+        "_fit",
+        lambda base, one: begun.append((one.screened.candidate.effect, one.screened.candidate.variant)),
+    )
+    assert search._scan(base, scores) == bool(fitted)
+    assert begun == fitted and all(known is best for known in beside)
 
 
 def test_what_hardly_any_body_has_needs_more_support() -> None:
