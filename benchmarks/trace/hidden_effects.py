@@ -165,11 +165,50 @@ def solid_cases() -> tuple[Case, ...]:
     )
 
 
-SETS = {"hidden_effects": cases, "hidden_kratos": kratos_cases, "hidden_solids": solid_cases}
+def fresh_cases() -> tuple[Case, ...]:
+    """Other motions, strengths and noise of bodies whose recorders have converged; the first of every two is silent.
+
+    They were drawn once and traced once, after all of the trace was written.
+    """
+
+    def drawn(number: int, low: float, high: float) -> float:
+        return float(np.random.default_rng(7300 + number).uniform(low, high))
+
+    def tilt(number: int, *axis: float) -> dict[str, dict[str, Any]]:
+        return {"gravity_tilt": {"degrees": drawn(number, 3.0, 6.0), "axis": list(axis)}}
+
+    def lag(number: int) -> dict[str, dict[str, Any]]:
+        return {"control_lag": {"seconds": drawn(number, 0.02, 0.05)}}
+
+    def drag(number: int, kind: str = "linear_drag", key: str = "c") -> dict[str, dict[str, Any]]:
+        return {kind: {key: drawn(number, 1.0, 2.5)}}
+
+    pairs: tuple[tuple[str, dict[str, dict[str, Any]]], ...] = (
+        ("rope", tilt(1, 1.0, 0.4, 0.0)), ("rope", drag(2, "quadratic_drag", "k")), ("taut rope", drag(3)),
+        ("taut rope", tilt(4, 1.0, 0.4, 0.0)), ("beam", drag(5)), ("beam", {"internal_viscosity": {"eta": drawn(6, 300.0, 800.0)}}),
+        ("cloth", drag(7)), ("capped_blob", drag(8)), ("capped_blob", lag(9)), ("calm_slab", lag(10)),
+    )  # fmt: skip
+    return tuple(
+        case
+        for k, (body, acts) in enumerate(pairs, start=1)
+        for case in (
+            Case(f"f{2 * k - 1:02d}", body, 300 + 2 * k - 1, answers=("nothing_to_explain",)),
+            Case(f"f{2 * k:02d}", body, 300 + 2 * k, acts),
+        )
+    )
+
+
+SETS = {
+    "hidden_effects": cases,
+    "hidden_kratos": kratos_cases,
+    "hidden_solids": solid_cases,
+    "hidden_fresh": fresh_cases,
+}
 TITLES = {
     "hidden_effects": "Recordings by other engines",
     "hidden_kratos": "Recordings by Kratos Multiphysics",
     "hidden_solids": "Converged recordings by Kratos Multiphysics",
+    "hidden_fresh": "Recordings by other engines, judged once",
 }
 
 
