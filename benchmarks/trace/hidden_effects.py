@@ -184,10 +184,17 @@ def fresh_cases() -> tuple[Case, ...]:
         return {kind: {key: drawn(number, 1.0, 2.5)}}
 
     pairs: tuple[tuple[str, dict[str, dict[str, Any]]], ...] = (
-        ("rope", tilt(1, 1.0, 0.4, 0.0)), ("rope", drag(2, "quadratic_drag", "k")), ("taut rope", drag(3)),
-        ("taut rope", tilt(4, 1.0, 0.4, 0.0)), ("beam", drag(5)),
-        ("beam", {"internal_viscosity": {"eta": drawn(6, 300.0, 800.0)}}), ("cloth", drag(7)), ("capped_blob", drag(8)), ("capped_blob", lag(9)), ("calm_slab", lag(10)),
-    )  # fmt: skip
+        ("rope", tilt(1, 1.0, 0.4, 0.0)),
+        ("rope", drag(2, "quadratic_drag", "k")),
+        ("taut rope", drag(3)),
+        ("taut rope", tilt(4, 1.0, 0.4, 0.0)),
+        ("beam", drag(5)),
+        ("beam", {"internal_viscosity": {"eta": drawn(6, 300.0, 800.0)}}),
+        ("cloth", drag(7)),
+        ("capped_blob", drag(8)),
+        ("capped_blob", lag(9)),
+        ("calm_slab", lag(10)),
+    )
     return tuple(
         case
         for k, (body, acts) in enumerate(pairs, start=1)
