@@ -69,7 +69,8 @@ class Grip:
         region_min_m, region_max_m: box of undeformed material that it holds, (3,) [m], or None.
         points: tracked points inside it.
         radius_m: instead of a box: it holds the material within this distance [m] of any of its controllers at the
-            first frame.
+            first frame, and when it takes hold again.
+        open_s: beginning and end of every time at which it holds nothing, in seconds from the first frame.
     """
 
     controllers: tuple[int, ...]
@@ -77,6 +78,7 @@ class Grip:
     region_max_m: Array | None = None
     points: tuple[int, ...] = ()
     radius_m: float | None = None
+    open_s: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -374,6 +374,7 @@ def _grip(facts: dict[str, Any]) -> Grip:
         region_max_m=None if high is None else _float64(high),
         points=tuple(facts.get("points") or ()),
         radius_m=None if facts.get("radius_m") is None else float(facts["radius_m"]),
+        open_s=tuple((float(begin), float(end)) for begin, end in facts.get("open_s") or ()),
     )
 
 
@@ -389,6 +390,7 @@ def _grip_facts(grips: tuple[Grip, ...], declared: list[Any] | None) -> list[dic
             "region_max_m": _list(grip.region_max_m),
             "points": list(grip.points),
             **({} if grip.radius_m is None else {"radius_m": grip.radius_m}),
+            **({} if not grip.open_s else {"open_s": [list(span) for span in grip.open_s]}),
         }
         for facts, grip in zip(same, grips, strict=True)
     ]

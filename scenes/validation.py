@@ -205,9 +205,27 @@ def check_grips(
         for i in grip.controllers:
             if owner.setdefault(i, g) != g:
                 findings.fault([*where, "controllers"], f"names controller {i}, which grip {owner[i]} holds")
+        _check_open(grip, measured, [*where, "open_s"], findings)
+        if any(begin <= 0.0 < end for begin, end in grip.open_s):
+            continue  # what it holds at the first frame is nothing
         _check_region(grip, declaration, arrays, measured, [*where, "region_min_m"], findings)
         if grip.radius_m is not None and all(i < controllers for i in grip.controllers):
             _check_radius(grip, grip.radius_m, declaration, measured, [*where, "radius_m"], findings)
+
+
+def _check_open(grip: GripForm, measured: Measured, where: list[str | int], findings: Findings) -> None:
+    """Times at which a grip is open: in their order, within the recording."""
+    before, last = 0.0, float(measured.times[-1] - measured.times[0])
+    for begin, end in grip.open_s:
+        if not (before <= begin < end):
+            findings.fault(
+                where,
+                f"holds {begin:g} to {end:g} s after {before:g} s; times begin, end and follow each other",
+            )
+            return
+        if begin > last:
+            findings.warn(where, f"begins at {begin:g} s, after the last frame at {last:g} s")
+        before = end
 
 
 def check_ground(ground: GroundForm, noise_sigma_m: float, measured: Measured, findings: Findings) -> None:

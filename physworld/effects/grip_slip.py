@@ -151,6 +151,8 @@ class GripSlip(Effect):
         held = held_count(twin)
         if held == 0:
             return f"{held} nodes are held: no grip that could give"
+        if twin.openings:
+            return f"{sum(one is not None for one in twin.openings)} of the grips let go"
         if twin.grip_softness > _SOFT:
             return f"the grips take hold over {twin.grip_softness:.2g} cells already"
         return None

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from physworld.arrays import Array
 from physworld.devices import default_device
+from physworld.engine.hands import Hand
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.term import Term
 from physworld.materials.laws import Law
@@ -17,11 +18,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class HeldNodes:
-    """Nodes that gripped material touches: their numbers (H,) and their paths at the frames, (T, H, 3) [m], [m/s]."""
+    """Nodes that gripped material touches: their numbers (H,) and their paths at the frames, (T, H, 3) [m], [m/s].
+
+    ``hands``: those of the grips that let go and take hold again; the others hold all the time.
+    """
 
     nodes: Array
     positions: Array
     velocities: Array
+    hands: tuple[Hand, ...] = ()
 
 
 @dataclass(frozen=True)

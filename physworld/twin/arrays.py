@@ -17,6 +17,7 @@ from physworld.geometry.body import ReferenceBody
 from physworld.materials.library import law_class
 from physworld.materials.plastic import PLASTICITIES
 from physworld.twin.colliders import from_parts, to_parts
+from physworld.twin.openings import Opening
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -49,6 +50,11 @@ def arrays_of(twin: Twin) -> dict[str, Array]:
         "self_friction": twin.self_friction,
         "formulation": twin.formulation,
         "transfer": twin.transfer,
+        **(
+            {}
+            if not twin.openings
+            else {"openings": [None if o is None else asdict(o) for o in twin.openings]}
+        ),
         "plasticity": None
         if twin.plasticity is None
         else {"name": twin.plasticity.name, "parameters": asdict(twin.plasticity)},
@@ -111,4 +117,8 @@ def parts_of(arrays: dict[str, Array]) -> dict[str, Any]:
         "properties": arrays.get("properties"),
         "natural": arrays.get("natural"),
         "drive": arrays.get("drive"),
+        "openings": tuple(
+            None if one is None else Opening(tuple(map(tuple, one["open_s"])), one["radius_m"])
+            for one in facts.get("openings", ())
+        ),
     }

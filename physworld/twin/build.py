@@ -31,6 +31,7 @@ from physworld.materials.sheet import SheetLaw
 from physworld.scene import AS_MEASURED, Scene
 from physworld.twin.colliders import carried, twin_colliders
 from physworld.twin.grips import declared_region, gripped_nodes, why_no_turn
+from physworld.twin.openings import opening_of
 from physworld.twin.rods import clamped, natural_of
 from physworld.twin.twin import Twin
 
@@ -92,6 +93,9 @@ def build_twin(
     held, taken = [], np.empty(0, dtype=int)
     for number, group in enumerate(groups):
         region = grips[number] if grips else None
+        if region is not None and any(begin <= 0 < end for begin, end in region.open_s):
+            held.append(np.empty(0, dtype=int))
+            continue
         nodes = np.setdiff1d(gripped_nodes(body, controls[0, group], region), taken)
         if isinstance(body.lattice, Chain) and scene.kind in SLENDER:
             nodes = clamped(body.lattice, nodes)
@@ -99,6 +103,13 @@ def build_twin(
         taken = np.concatenate([taken, nodes])
     if is_hung_sheet(scene, mesh):
         groups, held = (np.arange(2),), [upper_edge(body.lattice)]
+    openings = tuple(opening_of(grip, float(scene.times[0])) for grip in grips)
+    openings = openings if any(one is not None for one in openings) else ()
+    if openings and choice.formulation.on_particles:
+        raise SceneUnsupported(
+            f"{sum(one is not None for one in openings)} of {len(grips)} grips let go, which the updated Lagrangian "
+            "form does not follow"
+        )
     turning, notes = _turning(scene, body, controls[0], groups, held)
     self_friction, touching = _touching_itself(scene, body, choice.formulation)
     body = replace(body, notes=(*body.notes, *notes, *touching))
@@ -121,6 +132,7 @@ def build_twin(
         natural=natural_of(body, len(groups)),
         colliders=twin_colliders(scene, body.half_thickness_m, PRIOR_FRICTION),
         self_friction=self_friction,
+        openings=openings,
         plasticity=plasticity,
         formulation=choice.formulation.name,
         transfer=transfer,

@@ -98,6 +98,8 @@ class TwinRun:
             raise NotDifferentiable(
                 "a run of the updated Lagrangian form has no gradient: fit by simulations alone"
             )
+        if twin.openings:
+            raise NotDifferentiable("a run whose grips let go has no gradient: fit by simulations alone")
         self._twin, self._times = twin, frame_times
         self._drive = control_times, control_points, frame_times, properties
         self._integration = self._setting(twin)

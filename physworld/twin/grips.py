@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.engine.problem import HeldNodes
 from physworld.engine.rods.chain import Chain
 from physworld.engine.terms.soft_grips import AS_HELD, gripped_points, holds_a_part, touched_nodes
 from physworld.engine.terms.term import Term
@@ -150,14 +149,14 @@ def softly_held(twin: Twin) -> Twin:
     """
     regions = [region for region in twin.grip_regions if region is not None]
     parts = any(holds_a_part(twin.lattice, twin.body.start, region) for region in regions)
-    if not parts or not twin.form.supports("soft_grips") or twin.grip_softness > 0:
+    if not parts or twin.openings or not twin.form.supports("soft_grips") or twin.grip_softness > 0:
         return twin
     return replace(twin, grip_softness=AS_HELD)
 
 
 def soft_regions(twin: Twin) -> list[Array]:
-    """Boxes (2, 3) [m] that soft grips hold; none where all gripped nodes are prescribed."""
-    if twin.grip_softness <= 0 or not twin.form.supports("soft_grips"):
+    """Boxes (2, 3) [m] that soft grips hold; none where all gripped nodes are prescribed, or where a grip opens."""
+    if twin.grip_softness <= 0 or twin.openings or not twin.form.supports("soft_grips"):
         return []
     return [region for region in twin.grip_regions if region is not None]
 
@@ -173,18 +172,6 @@ def with_touched_nodes(twin: Twin, start: Array) -> Twin:
             nodes, taken = np.concatenate([nodes, more]), np.concatenate([taken, more])
         held.append(nodes)
     return replace(twin, held_nodes=tuple(held))
-
-
-def held_paths(twin: Twin, times: Array, controls: Array) -> HeldNodes:
-    """Paths of the held nodes at ``times`` (T,) [s] under control points (T, K, 3) [m]: rigid with their group."""
-    numbers, paths = [np.empty(0, dtype=int)], [np.empty((len(times), 0, 3))]
-    for group, nodes in zip(twin.controller_groups, twin.held_nodes, strict=True):
-        rotation, shift = rigid_motion(twin.controllers_start[group], controls[:, group])
-        numbers.append(nodes)
-        paths.append(np.einsum("tij,nj->tni", rotation, twin.body.start[nodes]) + shift[:, None])
-    positions = np.concatenate(paths, axis=1)
-    velocities = np.gradient(positions, times, axis=0, edge_order=2 if len(times) > 2 else 1)
-    return HeldNodes(np.concatenate(numbers), positions, velocities)
 
 
 def why_no_turn(body: ReferenceBody, nodes: Array, points: Array, noise_sigma_m: float | None) -> str | None:
@@ -216,7 +203,8 @@ def why_no_turn(body: ReferenceBody, nodes: Array, points: Array, noise_sigma_m:
 
 def twist_between_grips(twin: Twin, times: Array, controls: Array) -> tuple[Term, ...]:
     """Twist of a rope's spans between the grips that show a turn, at ``times`` (T,) under ``controls`` (T, K, 3)."""
-    turning = [g for g in twin.turning if len(twin.held_nodes[g])]
+    opening = {g for g, one in enumerate(twin.openings) if one is not None}
+    turning = [g for g in twin.turning if len(twin.held_nodes[g]) and g not in opening]
     if len(turning) < 2 or twin.law.torsion_n_m2 == 0:
         return ()
     extents = {g: _extent(twin.body, twin.held_nodes[g]) for g in turning}

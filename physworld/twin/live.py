@@ -7,8 +7,8 @@ mean velocity and ends with its own: what comes later is not known yet, so that 
 finished track by how much the velocities change from tick to tick.
 
 What needs the whole track beforehand is refused: colliders that move, twist between the grips of a straight rope, a
-rest shape that is driven from inside, grips that pull instead of prescribing, a stiffness that grows with time; and the
-updated Lagrangian form, whose runs are not kept open.
+rest shape that is driven from inside, grips that open at recorded times, grips that pull instead of prescribing, a
+stiffness that grows with time; and the updated Lagrangian form, whose runs are not kept open.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from physworld.engine.terms.soft_grips import BoundSoftGrips, SoftGrips
 from physworld.engine.terms.term import BoundTerm
 from physworld.engine.total.formulation import Run
 from physworld.errors import SceneUnsupported
-from physworld.twin.grips import held_paths
 from physworld.twin.integration import Integration
+from physworld.twin.openings import held_paths
 from physworld.twin.rods import sections_of
 from physworld.twin.twin import Twin
 
@@ -150,6 +150,8 @@ def refuse(twin: Twin) -> None:
     """Raises SceneUnsupported for a twin that cannot be run live; the message says why."""
     if twin.form not in (TOTAL, RODS):
         raise SceneUnsupported(f"a run of the {twin.form.title} form cannot be kept open")
+    if twin.openings:
+        raise SceneUnsupported("its grips open and close at recorded times")
     if twin.drive is not None:
         raise SceneUnsupported(
             f"{len(twin.drive)} steps of the rest shape are driven from inside at recorded times"

@@ -137,9 +137,15 @@ def sections_of(twin: Twin, held: HeldNodes, knots: Array, controls: Array) -> S
     assert isinstance(lattice, Chain) and twin.natural is not None
     grips = held_edges(lattice, twin.held_nodes)
     place = {int(node): k for k, node in enumerate(held.nodes)}
+    opening = [number for number, one in enumerate(twin.openings) if one is not None]
     # An effect may let go of a node that a grip holds; what is left of its edge is free to turn.
     edges = np.array(
-        [e for e in np.flatnonzero(grips >= 0) if e in place and lattice.parent[e] in place], dtype=int
+        [
+            e
+            for e in np.flatnonzero((grips >= 0) & ~np.isin(grips, opening))
+            if e in place and lattice.parent[e] in place
+        ],
+        dtype=int,
     )
     turns = np.zeros((len(knots), len(edges)))
     for column, edge in enumerate(edges):

@@ -37,8 +37,9 @@ from physworld.materials.laws import Law
 from physworld.materials.plastic import Plasticity
 from physworld.twin.arrays import arrays_of, parts_of
 from physworld.twin.colliders import TwinCollider
-from physworld.twin.grips import held_paths, soft_regions, twist_between_grips, with_touched_nodes
+from physworld.twin.grips import soft_regions, twist_between_grips, with_touched_nodes
 from physworld.twin.integration import Integration, solver_knots
+from physworld.twin.openings import Opening, held_paths, switch_times
 from physworld.twin.properties import together
 from physworld.twin.rods import sections_of
 
@@ -79,6 +80,7 @@ class Twin:
             ground's friction (P, 3), under everything that a run is given.
         natural: of a discrete rod, what its curvature and twist are made of (:mod:`physworld.twin.rods`), (R, 3).
         drive: of a discrete rod, steps of its rest shape that are driven from inside, (J, 6); None of others.
+        openings: when each grip is open, None for one that always holds; empty where all do.
         device: Warp device of the simulations; not part of the twin's identity.
     """
 
@@ -105,6 +107,7 @@ class Twin:
     properties: Array | None = None
     natural: Array | None = None
     drive: Array | None = None
+    openings: tuple[Opening | None, ...] = ()
     device: str = field(default_factory=default_device)
 
     @property
@@ -278,7 +281,8 @@ class Twin:
     ) -> Integration:
         """What :meth:`simulate_nodes` integrates, for whoever wants to integrate it otherwise: same arguments."""
         properties = together(self.properties, properties)
-        knots, frame_index = solver_knots(control_times, frame_times, 0.0 if from_rest else self.release_s)
+        stops = np.concatenate([control_times, switch_times(self.openings)])
+        knots, frame_index = solver_knots(stops, frame_times, 0.0 if from_rest else self.release_s)
         active = in_order(self.effects)
         for known in active:
             control_times, control_points = known.controls(control_times, control_points)

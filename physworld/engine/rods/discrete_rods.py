@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from physworld.arrays import Array
+from physworld.engine.hands import Openings
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.rods.chain import Chain
 from physworld.engine.rods.kernels import (
@@ -126,12 +127,17 @@ class DiscreteRods:
             SceneUnsupported: an edge has no length at the start.
         """
         self._check_start(x)
+        if held[0].hands and len(self.problems) > 1:
+            return [
+                DiscreteRods([one], self.time_step_s).run(x, v, [held[k % len(held)]], times, progress)[0]
+                for k, one in enumerate(self.problems)
+            ]
         if progress is not None:
             progress(0, len(times))
         launch = Launch(self, x, v, held, times)
         if self.sections[0].settles:
             launch.settle()
-        out = launch.whole() if not self.terms else launch.stepwise(progress)
+        out = launch.stepwise(progress) if self.terms or held[0].hands else launch.whole()
         if progress is not None:
             progress(len(times), len(times))
         size = float(self.chain.lengths.sum())
@@ -191,7 +197,11 @@ class Launch:
         chain, sections = rods.chain, rods.sections
         copies, count = len(sections), len(chain.parent)
         self.shape = (copies, count)
-        numbers = _numbers(held[0].nodes, count)
+        self._openings, self._opens = Openings(held[0], self.times, count), bool(held[0].hands)
+        if self._opens:
+            opened = self._openings
+            held = [HeldNodes(opened.nodes, opened.positions, opened.velocities)]
+        numbers = self._openings.slots
         edges = _numbers(sections[0].edges, count)
         directors = directors_along(chain, x)
         self.model = [
@@ -241,6 +251,12 @@ class Launch:
         """
         if frame == 0:
             self._begin()
+        elif self._opens and self._openings.enter(frame, self.state[0].numpy()[0]):
+            self.model[2].assign(self._openings.slots)
+            for array, path in zip(
+                self.path, (self._openings.positions, self._openings.velocities), strict=False
+            ):
+                array.assign(path[None])
         count = int(self._counts[frame])
         for term in self.rods.terms:
             term.pace(float(self.times[frame + 1] - self.times[frame]) / count)

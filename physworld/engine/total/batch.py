@@ -98,8 +98,11 @@ class Batch:
             what :meth:`physworld.engine.total.formulation.TotalLagrangian.run` would have raised.
 
         Raises:
-            BatchRefused: the bodies do not stop at the same times.
+            BatchRefused: the bodies do not stop at the same times, or a grip lets go.
         """
+        opening = sum(bool(own.hands) for own in held)
+        if opening:
+            raise BatchRefused(f"grips let go in {opening} of {len(held)} runs: they are integrated alone")
         longest = common_times(times)
         ends = [len(own) for own in times]
         run = _BatchRun(self, np.concatenate(x), np.concatenate(v), _joined(held, self, longest), longest)

@@ -99,13 +99,15 @@ def run_with_ledger(
         Nodal positions (T, n, 3) [m], the same as without a ledger, and the ledger.
 
     Raises:
-        SceneUnsupported: the body is a mesh of triangles.
+        SceneUnsupported: the body is a mesh of triangles, or a grip lets go.
         SimulationError: the run cannot be trusted.
     """
     if not problem.lattice.smooth:
         raise SceneUnsupported(
             f"the energy of {len(problem.lattice.cells)} cells of triangles: the ledger is of splines"
         )
+    if held.hands:
+        raise SceneUnsupported(f"{len(held.hands)} grips let go: the work of the grips is not kept")
     meter = _Meter(len(times))
     metered = replace(problem, terms=(_Marker(meter), *problem.terms, meter))
     solver = TotalLagrangian(metered, time_step_s)

@@ -23,6 +23,7 @@ import warp as wp
 
 from physworld.arrays import Array
 from physworld.engine.captured import CHUNK, Chunk
+from physworld.engine.hands import Openings
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.forces import InternalForces
 from physworld.engine.total.friction import FrictionForces
@@ -188,8 +189,8 @@ class SteppedRun(ABC):
 
     def __init__(self, solver: Stepped, x: Array, v: Array, held: HeldNodes, times: Array) -> None:
         device, nodes, frames = solver.device, len(solver.mass), len(times)
-        slot = np.full(nodes, -1, dtype=np.int32)
-        slot[held.nodes] = np.arange(len(held.nodes), dtype=np.int32)
+        self._openings, self._opens = Openings(held, times, nodes), bool(held.hands)
+        count = len(self._openings.nodes)
 
         def upload(values: Array, dtype: type = wp.float64) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
@@ -201,11 +202,11 @@ class SteppedRun(ABC):
         self.counter = wp.zeros(3, dtype=wp.int32, device=device)
         self._clocks = wp.zeros(3, dtype=wp.float64, device="cpu"), wp.zeros(3, dtype=wp.int32, device="cpu")
         self._size = float(np.ptp(x, axis=0).max()) + solver.cell_m
-        width = max(3 * len(held.nodes), 1)
-        paths = np.zeros((2, frames, width))
-        paths[0, :, : 3 * len(held.nodes)] = held.positions.reshape(frames, -1)
-        paths[1, :, : 3 * len(held.nodes)] = held.velocities.reshape(frames, -1)
-        self._nodes = [upload(solver.mass), upload(slot, wp.int32), upload(paths[0]), upload(paths[1])]
+        paths = np.zeros((2, frames, max(3 * count, 1)))
+        paths[0, :, : 3 * count] = self._openings.positions.reshape(frames, -1)
+        paths[1, :, : 3 * count] = self._openings.velocities.reshape(frames, -1)
+        slots = upload(self._openings.slots, wp.int32)
+        self._nodes = [upload(solver.mass), slots, upload(paths[0]), upload(paths[1])]
         self._relaxation = self._relaxing()
         self._begin()
         forces = solver.forces
@@ -232,6 +233,8 @@ class SteppedRun(ABC):
             ParticlesLeftTheGrid: a node is absurdly far from its start.
             ContactFailed: material came too deep into a collider.
         """
+        if self._opens and self._openings.enter(frame, self.x.numpy().reshape(-1, 3)):
+            self._prescribe()
         substeps = self._set_clock(frame)
         chunk = self._chunk(stages)
         for _ in range(substeps // CHUNK):
@@ -240,6 +243,13 @@ class SteppedRun(ABC):
         now: Array = self.x.numpy().reshape(-1, 3).copy()
         self._check(now, self._times[frame + 1])
         return now
+
+    def _prescribe(self) -> None:
+        """Bring what the grips prescribe to the device."""
+        openings, frames = self._openings, len(self._times)
+        self._nodes[1].assign(openings.slots)
+        for array, path in zip(self.paths, (openings.positions, openings.velocities), strict=True):
+            array.assign(path.reshape(frames, -1))
 
     def _chunk(self, asked: int | None) -> Chunk:
         """A chunk of substeps, captured once for every number of stages that friction takes."""

@@ -154,7 +154,11 @@ class UpdatedLagrangian:
         return ParticleRun(self, self._start(start, v), self.stress(), self.grips(held))
 
     def grips(self, held: HeldNodes) -> ParticleGrips:
-        """The particles that the held nodes grip."""
+        """The particles that the held nodes grip. Raises SceneUnsupported where a grip lets go."""
+        if held.hands:
+            raise SceneUnsupported(
+                f"{len(held.hands)} grips let go, which the updated Lagrangian form does not follow"
+            )
         return particle_grips(self.problem.lattice, self.solid, held.nodes, held.positions, held.velocities)
 
     def fit_nodes(self, particles: Array) -> Array:
