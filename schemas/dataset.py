@@ -94,6 +94,15 @@ class DatasetConfig(Request):
     features: Literal["auto", "supplied", "geometric"] = Field(
         default="auto", description="Part features: from the recording, from the geometry, or what there is."
     )
+    regrasp_share: float | None = Field(
+        default=None,
+        ge=0.0,
+        le=1.0,
+        description="Share of episodes in which one of several grips lets go for a while and takes hold again; empty: "
+        "half of them where a grip of the recording lets go, else none.",
+        json_schema_extra={"unit": "1"},
+        examples=[0.5],
+    )
     effects: Literal["perturbed", "as_found"] = Field(
         default="perturbed",
         description="Draw traced strengths within their intervals, or keep them as found.",

@@ -8,7 +8,8 @@ manifest: an artifact that lists (path, digest) of every episode.
 Arrays (T frames, P particles, K controllers): ``times`` (T,) f8 [s]; ``particles`` (T, P, 3) f4 [m];
 ``controllers`` (T, K, 3) f4 [m]; ``properties`` (P, 2 or 3) f4, log(E/E_fit), log(rho/rho_fit) and, where the
 ground's friction is perturbed, log(mu/mu_fit); ``vertices`` (T, M, 3) f4 [m] and ``vertex_index`` (M,) i4: some of
-the particles again, those that a world model takes for its vertices, so that a training need not read the others.
+the particles again, those that a world model takes for its vertices, so that a training need not read the others;
+where grips let go ``holding`` (T, G) u1: whether each of the G grips holds from that frame to the next.
 Chunks lie along the first axis inside a shard. Datasets made before ADR 33 hold a folder ``….zarr`` for each episode,
 with a file for each array and each header; they are read as ever.
 

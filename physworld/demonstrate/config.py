@@ -64,6 +64,8 @@ class DemonstrationConfig:
         unresolved: share of variance that the landmarks may miss anywhere; more are taken until it holds.
         strengths: intervals of effects' strengths; each episode draws its own within them.
         control_substeps: control points per tick that the twin is driven with.
+        regrasp_share: share of episodes in which one of several grips lets go for a while; None: half of them where a
+            grip of the recording lets go, else none.
         attempts: plans tried by ``make_episode`` before it gives up.
     """
 
@@ -88,6 +90,7 @@ class DemonstrationConfig:
     unresolved: float = 0.05
     strengths: tuple[StrengthRange, ...] = ()
     control_substeps: int = 4
+    regrasp_share: float | None = None
     attempts: int = 4
 
     def __post_init__(self) -> None:
@@ -102,6 +105,8 @@ class DemonstrationConfig:
             raise ValueError(f"properties {self.properties}; known are {', '.join(PROPERTIES)}, each once")
         if not (0.0 <= self.replay_share <= 1.0 and self.property_sigma >= 0.0):
             raise ValueError(f"replay share {self.replay_share:g}, property sigma {self.property_sigma:g}")
+        if self.regrasp_share is not None and not 0.0 <= self.regrasp_share <= 1.0:
+            raise ValueError(f"regrasp share {self.regrasp_share:g}; it is from 0 to 1")
         if not (self.density_ratio >= 0.0 and self.friction_ratio >= 0.0 and self.largest_factor > 1.0):
             raise ValueError(
                 f"density ratio {self.density_ratio:g}, friction ratio {self.friction_ratio:g}, largest factor "

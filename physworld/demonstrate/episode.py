@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +25,14 @@ from physworld.demonstrate.limits import MotionLimits, limits_of, pushers_of, tr
 from physworld.demonstrate.motion import random_motion
 from physworld.demonstrate.paths import PathStyle
 from physworld.demonstrate.properties import Drawn, draw_properties
+from physworld.demonstrate.regrasp import (
+    Regrasp,
+    able,
+    along_with_the_material,
+    closing_times,
+    drawn_regrasp,
+    led_on,
+)
 from physworld.demonstrate.replay import (
     VARIANTS,
     WARP,
@@ -41,6 +49,7 @@ from physworld.errors import (
     UnstableSimulation,
 )
 from physworld.scene import Scene
+from physworld.twin.openings import Opening, holding
 from physworld.worldmodel.clock import model_dt
 
 if TYPE_CHECKING:
@@ -65,6 +74,10 @@ class EpisodePlan:
         from_rest: whether the object starts without the recording's initial velocity.
         scale: how far the sampled motion was scaled down to keep its limits.
         size_m: the object's size, for the workspace check.
+        openings: when each grip is open; empty where all hold all the time.
+        regrasp: of a hand that is led on from where it closes; None of others.
+        limits: that its motion keeps then.
+        opens: whether some episode of this kind has a grip that opens, so that each says which hold.
     """
 
     times: Array
@@ -77,6 +90,10 @@ class EpisodePlan:
     from_rest: bool
     scale: float
     size_m: float
+    openings: tuple[Opening | None, ...] = ()
+    regrasp: Regrasp | None = None
+    limits: MotionLimits | None = None
+    opens: bool = False
 
     @property
     def properties(self) -> Array:
@@ -94,6 +111,7 @@ class EpisodePlan:
             "dt_s": float(self.times[1] - self.times[0]),
             "peak_control_speed_m_s": float(speeds.max(initial=0.0)),
             "control_reach_m": float(np.abs(self.controllers - self.controllers[0]).max(initial=0.0)),
+            **({} if self.regrasp is None else {"regrasp": asdict(self.regrasp)}),
             **self.drawn.attributes(),
         }
 
@@ -109,8 +127,8 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
     """
     if not twin.controller_groups and not pushers_of(scene):
         raise SceneUnsupported(f"scene {scene.name!r} has no controllers: no motion can be demonstrated")
-    choice, motion_generator, property_generator = (
-        np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(3)
+    choice, motion_generator, property_generator, grasps = (
+        np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(4)
     )
     limits = limits_of(scene, twin)
     dt = model_dt(scene.fps)
@@ -118,6 +136,7 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
     replays = choice.uniform() < config.replay_share
     if replays and training_track(scene)[0][-1] >= dt:  # shorter training frames hold no tick to replay
         motion, rate = str(choice.choice(VARIANTS)), float(np.exp(choice.uniform(*np.log(WARP))))
+        motion = "replay" if twin.openings else motion  # its grips open when they did
         from_rest, scale = motion != "replay", 1.0
         control_times, points = _replay(scene, twin, limits, motion, rate, duration, config.control_substeps)
     else:
@@ -130,6 +149,11 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
         )
         motion, points, scale = moved.pattern, moved.points, moved.scale
     ticks = slice(None, None, config.control_substeps)
+    share = regrasp_share_of(twin, config)
+    regrasp, openings = None, twin.openings if motion == "replay" else ()
+    if from_rest and grasps.uniform() < share:
+        regrasp = drawn_regrasp(twin, control_times[ticks], grasps)
+        openings = () if regrasp is None else regrasp.openings(len(twin.controller_groups))
     return EpisodePlan(
         times=control_times[ticks],
         controllers=points[ticks],
@@ -141,20 +165,52 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
         from_rest=from_rest,
         scale=scale,
         size_m=limits.size_m,
+        openings=openings,
+        regrasp=regrasp,
+        limits=limits,
+        opens=share > 0.0 or bool(twin.openings),
     )
+
+
+def regrasp_share_of(twin: Twin, config: DemonstrationConfig) -> float:
+    """Share of the episodes from rest in which a grip lets go; 0 where fewer than two hold something."""
+    wanted = config.regrasp_share
+    if wanted is None:
+        wanted = 0.5 if twin.openings else 0.0
+    return wanted if able(twin) else 0.0
 
 
 def run_episode(twin: Twin, plan: EpisodePlan, progress: Progress | None = None) -> dict[str, Array]:
-    """Simulate a plan: times (T,) f8; f4: particles (T, P, 3), controllers (T, K, 3), properties (P, 2 or 3)."""
-    particles = plan.drawn.twin(twin).simulate(
-        plan.control_times,
-        plan.control_points,
-        plan.times,
-        properties=plan.properties,
-        progress=progress,
-        from_rest=plan.from_rest,
-    )
-    return episode_arrays(plan, particles)
+    """Simulate a plan: times (T,) f8; f4: particles (T, P, 3), controllers (T, K, 3), properties (P, 2 or 3).
+
+    Where grips open, also holding (T, G) u1: whether each holds from a tick to the next; the controllers then stand to
+    the material as at the start (:mod:`physworld.demonstrate.regrasp`).
+    """
+    own = replace(plan.drawn.twin(twin), openings=plan.openings)
+
+    def nodes(points: Array, times: Array, told: Progress | None) -> Array:
+        return own.simulate_nodes(
+            plan.control_times,
+            points,
+            times,
+            properties=plan.properties,
+            progress=told,
+            from_rest=plan.from_rest,
+        )
+
+    if plan.regrasp is not None and plan.limits is not None:
+        asked = closing_times(float(plan.times[0]), plan.regrasp.close_s)
+        until = nodes(plan.control_points, asked, progress)[1:]
+        track = plan.control_times, plan.control_points
+        points = led_on(own, plan.regrasp, *track, until, plan.limits)
+        ticks = np.searchsorted(plan.control_times, plan.times - 1e-9)
+        plan = replace(plan, control_points=points, controllers=points[ticks])
+    moved = nodes(plan.control_points, plan.times, progress)
+    if not plan.opens:
+        return episode_arrays(plan, own.particles_at(moved))
+    held = holding(own, plan.times)
+    plan = replace(plan, controllers=along_with_the_material(own, plan.controllers, moved, held))
+    return {**episode_arrays(plan, own.particles_at(moved)), "holding": held}
 
 
 def episode_arrays(plan: EpisodePlan, particles: Array) -> dict[str, Array]:

@@ -140,7 +140,7 @@ def broken_limit(points: Array, limits: MotionLimits, times: Array) -> str | Non
     lowest = float(points[..., 2].min())
     if lowest < limits.floor_m - slack:
         return f"a control point is at {lowest:.4f} m, the floor for them at {limits.floor_m:.4f} m"
-    if not _keeps_spread(centres, limits):
+    if not keeps_spread(centres, limits):
         return "grips come further apart than the material between them is long, or too near each other"
     speeds = np.linalg.norm(np.diff(points, axis=0), axis=-1) / np.diff(times)[:, None]
     if float(speeds.max(initial=0.0)) > SPEED_MARGIN * limits.speed_m_s:
@@ -235,12 +235,12 @@ def _spread_check(first_pose: Array, movers: tuple[int, ...], limits: MotionLimi
     def allowed(displacement: Array) -> bool:
         centres = np.repeat(first[None], len(displacement), axis=0)
         centres[:, list(movers)] += displacement[:, None]
-        return _keeps_spread(centres, limits)
+        return keeps_spread(centres, limits)
 
     return allowed
 
 
-def _keeps_spread(centres: Array, limits: MotionLimits) -> bool:
+def keeps_spread(centres: Array, limits: MotionLimits) -> bool:
     """Whether grip centres (T, G, 3) stay within the allowed distances of each other."""
     slack = 1e-9 * max(limits.size_m, 1e-3)
     spread = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1)

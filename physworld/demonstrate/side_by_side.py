@@ -18,6 +18,7 @@ from physworld.demonstrate.episode import (
     all_rejected,
     episode_arrays,
     plan_episode,
+    regrasp_share_of,
     rejection,
     try_seed,
 )
@@ -48,10 +49,13 @@ def make_episodes(
         progress: told (frames done, frames in all) of every batch, or None.
 
     Raises:
-        BatchRefused: the twin cannot be simulated side by side, or its effects differ from episode to episode.
+        BatchRefused: the twin cannot be simulated side by side, its effects differ from episode to episode, or grips
+            let go.
     """
     if config.strengths:
         raise BatchRefused(f"{len(config.strengths)} strengths of effects that each episode draws for itself")
+    if regrasp_share_of(twin, config) > 0.0 or twin.openings:
+        raise BatchRefused("episodes in which grips let go are simulated one by one")
     made: list[Made | SimulationError | None] = [None] * len(seeds)
     rejected: list[list[dict[str, Any]]] = [[] for _ in seeds]
     waiting = list(range(len(seeds)))

@@ -30,7 +30,7 @@ from physworld.demonstrate import (
     plan_episode,
 )
 from physworld.demonstrate.coverage import Coverage
-from physworld.demonstrate.episode import episode_frames
+from physworld.demonstrate.episode import episode_frames, regrasp_share_of
 from physworld.demonstrate.side_by_side import make_episodes
 from physworld.errors import SimulationError
 from physworld.scene import Scene
@@ -162,6 +162,7 @@ def _made(
     seed = config.seed % 2**63
     width = WIDTHS[twin.device.partition(":")[0]]
     alone = not twin.form.supports("batches") or not twin.lattice.smooth
+    alone |= regrasp_share_of(twin, demonstration) > 0.0 or bool(twin.openings)
     if width == 1 or alone or demonstration.strengths:
         return make_episode(scene, twin, demonstration, derived_seed(seed, index), progress)
     first = index - index % width
@@ -197,6 +198,7 @@ def demonstration_of(config: DatasetConfig, strengths: tuple[StrengthRange, ...]
         space_scale=config.space_scale,
         features=config.features,
         strengths=strengths,
+        regrasp_share=config.regrasp_share,
         attempts=config.tries,
     )
 

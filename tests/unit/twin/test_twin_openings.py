@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_scene import GRAVITY, box_body, made_scene
+from made_scene import GRAVITY, made_scene
 from tiny_scene import tiny_scene
+from two_handed_bar import BAR, TIMES, hand, opened
+from two_handed_bar import two_handed_bar as bar
 
 from physworld.effects.registry import effect
 from physworld.errors import BatchRefused, EffectRefused, NotDifferentiable, SceneUnsupported
-from physworld.scene import Body, Grip, Scene
+from physworld.scene import Body, Grip
 from physworld.twin.batch import Episode, simulate_batch
 from physworld.twin.build import build_twin
 from physworld.twin.gradient import TwinRun
@@ -19,31 +21,7 @@ from physworld.twin.live import LiveTwin
 from physworld.twin.openings import Opening, holding
 from physworld.twin.twin import Twin
 
-LONG, WIDE = 0.2, 0.04
 OPEN, SHUT = 0.2, 0.3
-TIMES = np.arange(31) / 60.0
-BAR = {"youngs_modulus_pa": 2e5}
-
-
-def hand(x: float) -> np.ndarray:
-    """Four control points around an end of the bar, (4, 3) [m]."""
-    return np.array([[x, y, z] for y in (-0.02, 0.02) for z in (-0.02, 0.02)])
-
-
-def bar(first: Grip | None = None, second: Grip | None = None, **facts: object) -> Scene:
-    """A bar along x between two hands; gravity as given."""
-    places = np.stack(np.meshgrid(np.linspace(0, LONG, 9), (-0.02, 0.02), (-0.02, 0.02), indexing="ij"), -1)
-    low, high = np.array([0.0, -0.02, -0.02]), np.array([LONG, 0.02, 0.02])
-    reach = np.array([0.03, 0.05, 0.05])
-    grips = (
-        first or Grip((0, 1, 2, 3), low - 0.01, low + reach),
-        second or Grip((4, 5, 6, 7), high - reach, high + 0.01),
-    )
-    scene = made_scene(
-        places.reshape(-1, 3), "soft_body", np.concatenate([hand(0.0), hand(LONG)]), len(TIMES),
-        body=box_body(low, high, density_kg_m3=1000.0), grips=grips, times=TIMES, initial_state="undeformed",
-    )  # fmt: skip
-    return replace(scene, **facts)  # type: ignore[arg-type]
 
 
 def run(twin: Twin, controls: np.ndarray | None = None) -> np.ndarray:
@@ -56,10 +34,6 @@ def centre(twin: Twin, nodes: np.ndarray) -> np.ndarray:
     mass = twin.lattice.lumped(twin.particle_mass)
     middle: np.ndarray = np.einsum("n,tni->ti", mass, nodes) / mass.sum()
     return middle
-
-
-def opened(grip: Grip, *spans: tuple[float, float], radius_m: float | None = None) -> Grip:
-    return replace(grip, open_s=spans, radius_m=radius_m)
 
 
 def test_a_body_that_both_hands_let_go_of_falls_freely_with_the_speed_that_they_gave_it() -> None:
