@@ -29,7 +29,7 @@ def two_handed_bar(first: Grip | None = None, second: Grip | None = None, **fact
         second or Grip((4, 5, 6, 7), high - reach, high + 0.01),
     )
     scene = made_scene(
-        places.reshape(-1, 3), "soft_body", np.concatenate([hand(0.0), hand(LONG)]), len(TIMES),
+        places.reshape(-1, 3), "beam", np.concatenate([hand(0.0), hand(LONG)]), len(TIMES),
         body=box_body(low, high, density_kg_m3=1000.0), grips=grips, times=TIMES, initial_state="undeformed",
     )  # fmt: skip
     return replace(scene, **facts)  # type: ignore[arg-type]

@@ -139,6 +139,16 @@ def test_the_round_trip_is_exact_and_loses_nothing() -> None:
     assert kept["body"]["mass_kg"] is None
 
 
+def test_when_a_grip_is_open_survives_the_round_trip() -> None:
+    declared, arrays = sound_parts()
+    declared["grips"][0] = {"controllers": [0, 1, 2, 3], "open_s": [[0.2, 0.4], [0.5, 0.6]]}
+    scene = scene_from_parts(declared, arrays)
+    assert scene.grips[0].open_s == ((0.2, 0.4), (0.5, 0.6))
+    again, _ = bundle_from_bytes(canonical_archive(scene))
+    assert again.grips[0].open_s == scene.grips[0].open_s
+    assert "open_s" not in parts_of(sound_scene())[0]["grips"][0]
+
+
 def test_the_radius_of_a_grip_survives_the_round_trip() -> None:
     declared, arrays = sound_parts()
     declared["grips"][0] = {"controllers": [0, 1, 2, 3], "radius_m": 0.03}

@@ -199,6 +199,8 @@ FAULTS: list[tuple[str, Break, str, str]] = [
     ),
     ("grip inverted", grip(region_min_m=[0.1, 0, 0.5]), "region_min_m", "in x"),
     ("grip half", grip(region_max_m=None), "region_min_m", "together"),
+    ("grip open backwards", grip(open_s=[[0.2, 0.1]]), "open_s", "0.2 to 0.1 s"),
+    ("grip open twice at once", grip(open_s=[[0.0, 0.2], [0.1, 0.3]]), "open_s", "0.1 to 0.3 s after 0.2 s"),
     ("grip by both", grip(radius_m=0.03), "radius_m", "not both"),
     ("grip by nothing", grip(radius_m=0.0), "radius_m", "greater than 0"),
     (
@@ -329,6 +331,7 @@ WARNINGS: list[tuple[str, Break, str]] = [
         grip(radius_m=1e-4, region_min_m=None, region_max_m=None),
         "is 0.0001 m, the nearest visible point is",
     ),
+    ("open late", grip(open_s=[[50.0, 60.0]]), "begins at 50 s, after the last frame"),
     ("tilted gravity", declare(gravity_m_s2=[0.5, 0, -9.8]), "2.9 degrees away from -z"),
     ("no gravity", declare(gravity_m_s2=[0, 0, 0]), "nothing falls"),
     ("moon", declare(gravity_m_s2=[0, 0, -1.62]), "1.62"),
