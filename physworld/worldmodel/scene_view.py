@@ -46,6 +46,8 @@ class SceneView:
         history: h.
         twin_steps_per_second: ticks that the twin simulates in a second of computing.
         skin_error_m: mean distance between skinned and twin's own tracked points.
+        grips: the controllers of each grip.
+        holding: numbers of the grips whose controllers are vertices of the graph; None: all.
     """
 
     scene: Scene
@@ -59,6 +61,8 @@ class SceneView:
     history: int
     twin_steps_per_second: float
     skin_error_m: float
+    grips: tuple[tuple[int, ...], ...] = ()
+    holding: tuple[int, ...] | None = None
 
     @property
     def start_history(self) -> Array:
@@ -106,11 +110,24 @@ class SceneView:
             start_time_s=float(self.times[self.first]),
             skin=self.skin,
             strengths=strengths,
+            grips=self.grips,
+            holding=self.holding,
         )
 
 
-def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
-    """Simulate the twin on the recording's controllers and read it with the graph. Raises GraphInvalid."""
+def view_scene(
+    scene: Scene, twin: Twin, config: WorldModelConfig, holding: tuple[int, ...] | None = None
+) -> SceneView:
+    """Simulate the twin on the recording's controllers and read it with the graph. Raises GraphInvalid.
+
+    Args:
+        scene: the recording.
+        twin: calibrated on it.
+        config: of the graph.
+        holding: numbers of the grips that the graph is for; None: all, as in the recording.
+    """
+    if holding == tuple(range(len(twin.controller_groups))):
+        holding = None
     dt = model_dt(scene.fps)
     control_times, control_points = scene.control_track()
     times = clock_times(float(scene.times[-1] - scene.times[0]), dt)
@@ -130,6 +147,7 @@ def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
         dt_s=dt,
         config=config,
         control_groups=twin.controller_groups,
+        holding=holding,
         ground_height_m=twin.ground_height_m,
         gravity_m_s2=np.asarray(twin.gravity_m_s2),
     )
@@ -148,4 +166,6 @@ def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
         history=config.history,
         twin_steps_per_second=(len(times) - 1) / seconds,
         skin_error_m=float(np.linalg.norm(skin.apply(vertices) - tracks, axis=2).mean()),
+        grips=tuple(tuple(group.tolist()) for group in twin.controller_groups),
+        holding=holding,
     )
