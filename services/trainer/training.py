@@ -69,7 +69,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
     context.plan(stages_of(config))
     context.begin(READING)
-    view = view_scene(scene, twin, architecture)
+    view = view_scene(scene, twin, architecture, None if config.holding is None else tuple(config.holding))
     strengths = _strengths(stores, payload)
     episodes = Episodes(
         context,
@@ -80,12 +80,16 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         strengths,
         None if twin.ground_height_m is None else twin.ground_friction,
         {f"{one.name}.{part.name}": part.unit for one in twin.effects for part in type(one).strengths(twin)},
+        len(view.grips),
+        view.holding,
     )
     started = time.perf_counter()
     start = _start(stores, config)
     network = None if start is None else model_of(stores, start).model
     trained = _train(context, stores, episodes, view, architecture, training, network)
     training_s = time.perf_counter() - started
+    if not view.as_recorded:  # there is no recording of it to fine-tune on
+        tuning = replace(tuning, steps=0)
     context.begin(FINE_TUNING, "steps", tuning.steps)
     phi = np.zeros((view.spec.object_count, 2))
     started = time.perf_counter()
@@ -185,7 +189,15 @@ def _train(
     """Train, from the checkpoint of an earlier attempt where there is one."""
     job_id = context.lease.job_id
     first = first_episodes(episodes.total, training.start_share)
-    tracks = [episodes.track(index) for index in range(first)]
+    tracks = [episodes.tracks(index) for index in range(first)]
+    spans = [track for parts in tracks for track in parts]
+    if not spans:
+        raise DatasetUnusable(
+            f"in none of the {first} episodes that the training begins with exactly the grips {config_said(view)} hold"
+        )
+    if episodes.lets_go:
+        ahead = look_ahead_for(spans, architecture.history, training.look_ahead)
+        training = replace(training, look_ahead=ahead)
 
     device = torch_device(stores.settings.device)
     logger.info("job %s trains on %s", job_id, device)
@@ -216,7 +228,7 @@ def _train(
             training,
             columns=episodes.columns,
             total=episodes.total,
-            later=episodes.track,
+            later=episodes.tracks,
             checkpoint=checkpoint,
             save_checkpoint=lambda data: stores.scratch.put(job_id, CHECKPOINT, data),
             progress=progress,

@@ -1,8 +1,8 @@
 """A bar of masses and springs between two grips, of which the second lets go for a while: a world to learn in which
 what holds the body changes, independent of the engine.
 
-Episodes are integrated side by side. While the second grip is open its controllers are the rigid motion of the particles
-that it held; from closing on it moves them, and what it holds, from where they are.
+Episodes are integrated side by side. While the second grip is open its controllers are the rigid motion of the
+particles that it held; from closing on it moves them, and what it holds, from where they are.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from physworld.geometry.rigid import rigid_motion
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.graph import GraphSpec, build_graph
 
-DT_S, SPACING_M, SUBSTEPS = 1.0 / 30.0, 0.02, 40
+DT_S, SPACING_M, SUBSTEPS = 1.0 / 30.0, 0.02, 30
 COLUMNS, ROWS, FRAMES = 9, 2, 60
 GRAVITY_M_S2 = np.array([0.0, 0.0, -0.5])
 STIFFNESS_S2, DAMPING_S = 8_000.0, 40.0
 GRIPS = (np.arange(4), np.arange(4, 8))
 BOTH, LEFT = (0, 1), (0,)
-SMALL = WorldModelConfig(hidden=16, message_passing_steps=2, history=2, vertices=36, neighbours=5, modes=24)
+SMALL = WorldModelConfig(hidden=16, message_passing_steps=2, history=2, vertices=36, neighbours=5, modes=12)
 
 
 def lattice() -> np.ndarray:
@@ -58,49 +58,49 @@ def episodes(count: int, seed: int = 0) -> list[dict[str, np.ndarray]]:
     ends[np.arange(len(i)), i], ends[np.arange(len(i)), j] = -1.0, 1.0
     length = np.linalg.norm(ends @ rest, axis=1)
     opened, closed = rng.integers(8, 24, count), rng.integers(34, 46, count)
-    rate, phase = rng.uniform(3.0, 6.0, (2, count, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, (2, count, 1, 3))
-    swing = 0.012 * rng.normal(size=(2, count, 1, 3))
-    swing[1, :, :, 0] *= 0.2  # the hands hardly stretch the bar
+    rate, phase = rng.uniform(3.0, 6.0, (2, count, 3)), rng.uniform(0.0, 2.0 * np.pi, (2, count, 3))
+    swing = 0.012 * rng.normal(size=(2, count, 3))
+    swing[1, :, 0] *= 0.2  # the hands hardly stretch the bar
 
     def moved(hand: int, t: float) -> np.ndarray:
-        """How far a hand has moved since the start (count, 1, 3)."""
+        """How far a hand has moved since the start (count, 3)."""
         return swing[hand] * (np.sin(rate[hand] * t + phase[hand]) - np.sin(phase[hand]))
 
     step = DT_S / SUBSTEPS
-    x, v = np.repeat(rest[None], count, axis=0), np.zeros((count, *rest.shape))
-    hold = x[:, HELD[1]].copy()  # what the second grip moves, and where its hand was then
-    since = np.zeros((count, 1, 3))
-    path, driven = [x.copy()], [x[:, np.concatenate(HELD)].copy()]
+    x = np.repeat(rest[:, None], count, axis=1)  # (36, count, 3)
+    v = np.zeros_like(x)
+    hold = x[
+        HELD[1]
+    ].copy()  # what the second grip moves, and how far its hand had moved when it took hold of it
+    since = np.zeros((count, 3))
+    path, driven = [x.copy()], [x[np.concatenate(HELD)].copy()]
     for frame in range(FRAMES - 1):
         holds = (frame < opened) | (frame >= closed)
-        for k in np.flatnonzero(frame == closed):
-            hold[k], since[k] = driven[-1][k, GRIPS[1]], moved(1, frame * DT_S)[k]
+        taken = frame == closed
+        hold[:, taken], since[taken] = driven[-1][GRIPS[1]][:, taken], moved(1, frame * DT_S)[taken]
         for tick in range(1, SUBSTEPS + 1):
             t = frame * DT_S + tick * step
-            along = np.einsum("sp,epx->esx", ends, x)
-            now = np.linalg.norm(along, axis=2, keepdims=True)
-            pull = STIFFNESS_S2 * (1.0 - length[:, None] / now) * along
-            pull += DAMPING_S * np.einsum("sp,epx->esx", ends, v)
-            v = v + step * (GRAVITY_M_S2 - np.einsum("sp,esx->epx", ends, pull))
-            new = x + step * v
-            new[:, HELD[0]] = rest[HELD[0]] + moved(0, t)
-            new[np.ix_(holds, HELD[1])] = (hold + moved(1, t) - since)[holds]
-            v = (new - x) / step
-            x = new
+            along = np.tensordot(ends, x, axes=1)
+            now = np.sqrt(np.einsum("sex,sex->se", along, along))[..., None]
+            pull = STIFFNESS_S2 * (1.0 - length[:, None, None] / now) * along
+            pull += DAMPING_S * np.tensordot(ends, v, axes=1)
+            new = x + step * (v + step * (GRAVITY_M_S2 - np.tensordot(ends.T, pull, axes=1)))
+            new[HELD[0]] = rest[HELD[0], None] + moved(0, t)
+            new[HELD[1]] = np.where(holds[:, None], hold + moved(1, t) - since, new[HELD[1]])
+            x, v = new, (new - x) / step
         path.append(x.copy())
-        controllers = x[:, np.concatenate(HELD)].copy()
-        for k in np.flatnonzero(~holds):
-            turns, shifts = rigid_motion(rest[HELD[1]], x[k, HELD[1]][None])
-            controllers[k, GRIPS[1]] = rest[HELD[1]] @ turns[0].T + shifts[0]
+        controllers = x[np.concatenate(HELD)].copy()
+        turns, shifts = rigid_motion(rest[HELD[1]], x[HELD[1]].swapaxes(0, 1))
+        carried = (rest[HELD[1]] @ turns.swapaxes(1, 2) + shifts[:, None]).swapaxes(0, 1)
+        controllers[4:] = np.where(holds[:, None], controllers[4:], carried)
         driven.append(controllers)
-    ticks = np.arange(FRAMES)[:, None]
-    ticks[-1] = FRAMES - 2
-    shut = ((ticks < opened) | (ticks >= closed)).astype(np.uint8)
+    frames = np.minimum(np.arange(FRAMES), FRAMES - 2)[:, None]
+    shut = ((frames < opened) | (frames >= closed)).astype(np.uint8)
     return [
         {
             "times": np.arange(FRAMES) * DT_S,
-            "particles": np.array(path)[:, k].astype(np.float32),
-            "controllers": np.array(driven)[:, k].astype(np.float32),
+            "particles": np.array(path)[:, :, k].astype(np.float32),
+            "controllers": np.array(driven)[:, :, k].astype(np.float32),
             "properties": np.zeros((len(rest), 2), dtype=np.float32),
             "holding": np.stack([np.ones(FRAMES, dtype=np.uint8), shut[:, k]], axis=1),
         }
