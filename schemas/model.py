@@ -90,8 +90,8 @@ class TrainingConfig(Request):
         default=None,
         min_length=1,
         max_length=1000,
-        description="Numbers of the grips that hold, from 0: the version learns from the spans of the demonstrations in "
-        "which exactly these hold; null: all.",
+        description="Numbers of the grips that hold, from 0: the version learns from the spans of the demonstrations "
+        "in which exactly these hold; null: all.",
         examples=[[0]],
     )
     start_from: str | None = Field(

@@ -65,6 +65,11 @@ class SceneView:
     holding: tuple[int, ...] | None = None
 
     @property
+    def as_recorded(self) -> bool:
+        """Whether the graph's grips are those that hold in the recording, so that it says what the model should do."""
+        return self.holding is None
+
+    @property
     def start_history(self) -> Array:
         """(h+1, n, 3) [m]."""
         return self.vertices[self.first : self.first + self.history + 1]
@@ -76,11 +81,11 @@ class SceneView:
         return resample_smooth(ticks, self.times, self.scene.times - self.scene.times[0])
 
     def recording(self) -> Recording:
-        """The training frames for fine-tuning: those after the network's history."""
+        """The training frames for fine-tuning: those after the network's history, none where other grips hold."""
         ticks = (self.scene.times - self.scene.times[0]) / self.spec.dt_s - self.first
         begin, end = self.scene.train
         taken = np.arange(begin, end)
-        taken = taken[ticks[taken] > self.history]
+        taken = taken[(ticks[taken] > self.history) & self.as_recorded]
         return Recording(
             history=self.start_history,
             controllers=self.controllers[self.first :],

@@ -51,6 +51,8 @@ class Episodes:
     Attributes:
         total: how many there are, or will be.
         columns: of Φ: the properties, the ground's friction and the effects' strengths if the episodes differ in them.
+        grip_count: G, of the twin.
+        grips: that hold in the parts of the episodes that are read.
         lets_go: whether an episode that was read says which grips hold, so that parts of it are learned from.
         reached: steps taken and to take, for the progress while it waits.
 
@@ -63,8 +65,8 @@ class Episodes:
         strengths: intervals of the twin's effects, of which each becomes a column of Φ.
         ground_friction: calibrated coefficient; None without a ground.
         units: of the strengths, by the names of their columns.
-        grip_count: G, of the twin.
-        grips: that hold in the parts of the episodes that are read; None: all.
+        grip_count: G.
+        grips: that hold; None: all.
     """
 
     def __init__(
@@ -82,7 +84,7 @@ class Episodes:
     ) -> None:
         self._context, self._stores, self._dataset_id = context, stores, dataset_id
         self._spec, self._history = spec, history
-        self._grip_count, self._grips = grip_count, every_grip(grip_count) if grips is None else grips
+        self.grip_count, self.grips = grip_count, every_grip(grip_count) if grips is None else grips
         dataset = self._dataset()
         self.total = dataset.config.episodes
         perturbed = dataset.config.effects != "as_found"
@@ -103,7 +105,11 @@ class Episodes:
         self.lets_go = False
 
     def tracks(self, index: int) -> list[Track]:
-        """The parts of episode ``index`` in which exactly the grips hold, once it is there. Raises Cancelled, LeaseLost, DatasetIncomplete or EpisodeCorrupt."""
+        """The parts of episode ``index`` in which exactly the grips hold, once it is there.
+
+        Raises:
+            Cancelled, LeaseLost, DatasetIncomplete, EpisodeCorrupt, DatasetUnusable: what stands in the way.
+        """
         while (episode := self._committed(index)) is None:
             if self._dataset().state in {"failed", "cancelled", "sealed"}:
                 raise DatasetIncomplete(
@@ -124,9 +130,8 @@ class Episodes:
             if one.calibrated is not None
         }
         self.lets_go |= "holding" in arrays
-        return held_tracks(
-            self._spec, arrays, self._grips, self._grip_count, self._history, self.columns, values
-        )
+        own = (self.grips, self.grip_count, self._history)
+        return held_tracks(self._spec, arrays, *own, self.columns, values)
 
     def tuned(self, strengths: Mapping[str, float]) -> dict[str, Any]:
         """What fine-tuning chose of the shared columns, in physical units beside what the calibration said."""

@@ -3,7 +3,10 @@
 Reads the episodes (``physworld_services.trainer.episodes``), trains with a checkpoint every few hundred steps, kept in
 the scratch store (a killed trainer, or another one in its place, carries on from the last one), fine-tunes the
 properties on the recording's training frames, measures everything open loop on the frames that were held out, and
-stores the version's files:
+stores the version's files. A version for grips that do not hold alone in the recording has nothing there to be tuned on
+or measured by: its card has the validation on the demonstrations.
+
+The files:
 
 * ``model.safetensors``: see ``physworld.worldmodel.model.model`` and ``.published``;
 * ``step.pt2``, ``step.onnx``: one step as a program (``physworld.worldmodel.export``);
@@ -20,6 +23,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,8 +31,9 @@ import numpy as np
 from physworld.demonstrate.config import StrengthRange
 from physworld.demonstrate.properties import ranges_of
 from physworld.devices import torch_device
-from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
+from physworld.worldmodel.errors import CheckpointMismatch, DatasetUnusable, TrainingCancelled
 from physworld.worldmodel.finetune import FineTuneResult, fine_tune
+from physworld.worldmodel.holding.spans import look_ahead_for
 from physworld.worldmodel.model import config as settings_of
 from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.model import WorldModel
@@ -88,8 +93,6 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     network = None if start is None else model_of(stores, start).model
     trained = _train(context, stores, episodes, view, architecture, training, network)
     training_s = time.perf_counter() - started
-    if not view.as_recorded:  # there is no recording of it to fine-tune on
-        tuning = replace(tuning, steps=0)
     context.begin(FINE_TUNING, "steps", tuning.steps)
     phi = np.zeros((view.spec.object_count, 2))
     started = time.perf_counter()
@@ -193,7 +196,8 @@ def _train(
     spans = [track for parts in tracks for track in parts]
     if not spans:
         raise DatasetUnusable(
-            f"in none of the {first} episodes that the training begins with exactly the grips {config_said(view)} hold"
+            f"in none of the {first} episodes that the training begins with the grips {list(episodes.grips)}, and no "
+            f"other of {episodes.grip_count}, hold for a step or more"
         )
     if episodes.lets_go:
         ahead = look_ahead_for(spans, architecture.history, training.look_ahead)
@@ -300,5 +304,7 @@ def _metrics(
         "skin_error_m": view.skin_error_m,
         "world_model_against_twin_m": float(
             np.linalg.norm(measured.tracks_calibrated - measured.twin_tracks, axis=2).mean()
-        ),
+        )
+        if view.as_recorded
+        else None,
     }
