@@ -12,7 +12,7 @@ from hanging_rope import graph as rope_graph
 from hanging_rope import rest as rope_at_rest
 from released_bar import BOTH, GRIPS, LEFT, SMALL, episodes, graph
 
-from physworld.worldmodel.dataset import Track, read_track
+from physworld.worldmodel.dataset import Track, read_track, split_tracks
 from physworld.worldmodel.errors import ControlsInvalid, DatasetUnusable, GraphInvalid
 from physworld.worldmodel.holding.rollout import HeldModels, HeldVersions
 from physworld.worldmodel.holding.spans import (
@@ -28,7 +28,7 @@ from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.skinning import affine_skin
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.rollout import rollout
-from physworld.worldmodel.training import train
+from physworld.worldmodel.training import open_loop_error, train
 
 LEARNED, JUDGED, H = 18, 4, SMALL.history
 PRIOR_ALONE = TrainingConfig(steps=1, batch_size=1, look_ahead=2, prior="modal")
@@ -130,6 +130,9 @@ def test_episodes_without_the_set_are_passed_over_and_parts_of_one_stay_together
     first = [read_track(graph(BOTH), arrays, H) for arrays in every()[:3]]
     alone = train([[track] for track in first], graph(BOTH), SMALL, PRIOR_ALONE)
     assert alone.prior_error_m == train(first, graph(BOTH), SMALL, PRIOR_ALONE).prior_error_m
+    _, judged = split_tracks(spans[:2], PRIOR_ALONE.validation_fraction, PRIOR_ALONE.seed)
+    two = train(spans[:2], graph(BOTH), SMALL, PRIOR_ALONE)
+    assert len(judged[0]) == 2 and two.best_error_m == open_loop_error(two.model, judged[0])
     with pytest.raises(DatasetUnusable, match="first 2 of 2 episodes have no part"):
         train([[], []], graph(BOTH), SMALL, PRIOR_ALONE)
     with pytest.raises(DatasetUnusable, match=r"in none of 1 episodes the grips \[1\] of 2 hold"):
@@ -137,25 +140,27 @@ def test_episodes_without_the_set_are_passed_over_and_parts_of_one_stay_together
 
 
 def test_models_that_hand_over_follow_a_grip_that_lets_go_and_takes_hold_again(models: HeldModels) -> None:
-    """Against the model of all grips, told that the open hand stays, and against following the grips that hold."""
-    ours, unchanged, rigid = [], [], []
+    """Against the model of all grips alone, and against following the first grip rigidly.
+
+    What the open grip's material does is not told: its hand stays where it let go, and is back when it closes.
+    """
+    one, parts = models.members[BOTH], []
     for arrays in every()[LEARNED:]:
         true, controllers = true_path(arrays), arrays["controllers"].astype(float)
-        holding = arrays["holding"]
-        _, opened, closed = spans_of(holding)
-        window = slice(opened.first, closed.first + 1)
-        ours.append(distances(models.rollout(true[: H + 1], controllers, holding, PHI), arrays))
-        away = controllers.copy()
-        away[window, 4:] = away[opened.first, 4:]
-        one = models.members[BOTH]
-        unchanged.append(distances(rollout(one, one.spec, true[: H + 1], away, PHI), arrays)[window])
-        moved = controllers[:, :4].mean(axis=1) - controllers[0, :4].mean(axis=0)
-        rigid.append(distances(true[0] + moved[:, None], arrays))
-        ours[-1], rigid[-1] = ((one[window], one[closed.first + 1 :]) for one in (ours[-1], rigid[-1]))
-    while_open, after = (np.concatenate(part).mean() for part in zip(*ours, strict=True))
-    rigid_open, rigid_after = (np.concatenate(part).mean() for part in zip(*rigid, strict=True))
-    assert while_open < 0.4 * np.concatenate(unchanged).mean() and while_open < 0.4 * rigid_open
-    assert after < 0.25 * rigid_after
+        _, opened, closed = spans_of(arrays["holding"])
+        controllers[opened.first : closed.first, 4:] = controllers[opened.first, 4:]
+        paths = (
+            models.rollout(true[: H + 1], controllers, arrays["holding"], PHI),
+            rollout(one, one.spec, true[: H + 1], controllers, PHI),
+            true[0] + (controllers[:, :4].mean(axis=1) - controllers[0, :4].mean(axis=0))[:, None],
+        )
+        errors = [distances(path, arrays) for path in paths]
+        open_, after = slice(opened.first, closed.first + 1), slice(closed.first + 1, None)
+        parts.append([[error[part].mean() for error in errors] for part in (open_, after)])
+    while_open, after_it = np.mean(parts, axis=0)
+    assert while_open[0] < 0.4 * while_open[1:].min()
+    assert after_it[0] < 0.9 * after_it[1]  # which is told where the hand has the material now
+    assert after_it[0] < 0.25 * after_it[2]
 
 
 def test_without_a_change_it_is_the_rollout_of_one_model(models: HeldModels) -> None:
