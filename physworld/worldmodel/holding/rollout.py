@@ -157,7 +157,11 @@ class HeldModels:
 
 @dataclass(frozen=True)
 class HeldVersions:
-    """Published versions of one body, one for each set of grips, as one model.
+    """Published versions of one body, one for each set of grips, as one model:
+
+        versions = [PublishedModel.from_card(tensors, card) for tensors, card in downloaded]
+        holding[20:50, 1] = 0                       # the second grip lets go, and takes hold again
+        vertices = HeldVersions.of(versions).rollout(controllers, holding)
 
     Attributes:
         models: their networks.
