@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, computed_field
+from pydantic import Field, computed_field, field_validator
 
 from physworld_schemas.base import UNIT_OF_METRIC, Artifact, Lineage, Request, Resource, Seed, Tag
 from physworld_schemas.quality import Quality, quality_of
@@ -25,6 +25,8 @@ class TrainingConfig(Request):
     where the scene has one) or ``auto``: what errs less on episodes that are not learned from. ``near_edges``:
     ``current`` finds the neighbours anew at every step, so that parts of the object that meet see each other.
     ``start_from``: a version, perhaps of another object, from whose network the training goes on.
+    ``holding``: where grips let go, a version for one set of those that hold; a rollout goes from one version to the
+    next as the set changes (``physworld.worldmodel.holding``).
     """
 
     hidden: int = Field(
@@ -84,6 +86,14 @@ class TrainingConfig(Request):
         default="material",
         description="Neighbours fixed in the material, or found anew at every step (parts that meet).",
     )
+    holding: list[Annotated[int, Field(ge=0, le=1000)]] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=1000,
+        description="Numbers of the grips that hold, from 0: the version learns from the spans of the demonstrations "
+        "in which exactly these hold; null: all.",
+        examples=[[0]],
+    )
     start_from: str | None = Field(
         default=None,
         pattern=r"^[a-z0-9][a-z0-9._-]{0,63}:[a-z0-9][a-z0-9._-]{0,63}$",
@@ -124,6 +134,13 @@ class TrainingConfig(Request):
         description="Seed of every random choice; the same seed gives the same result.",
         examples=[0],
     )
+
+    @field_validator("holding")
+    @classmethod
+    def _each_grip_once(cls, holding: list[int] | None) -> list[int] | None:
+        if holding is not None and len(set(holding)) < len(holding):
+            raise ValueError("names a grip twice")
+        return None if holding is None else sorted(holding)
 
 
 class TrainingCreate(Request):

@@ -3,14 +3,15 @@
 An episode's arrays: ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controllers`` (T, K, 3) [m],
 ``properties`` (P, 2) = log(E/E_fit), log(ρ/ρ_fit), and log(μ/μ_fit) as a third where the ground's friction was
 perturbed. A stored episode may keep ``vertices`` (T, M, 3), the particles ``vertex_index`` (M,), beside or
-instead of the particles. Everything random comes from the ``torch.Generator``
-that is passed in.
+instead of the particles, and where grips let go ``holding`` (T, G) (``physworld.worldmodel.holding.spans``).
+Everything random comes from the ``torch.Generator`` that is passed in.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -27,7 +28,8 @@ from physworld.worldmodel.model.properties import EPISODE_FIELDS, PROPERTIES, Ph
 SCALE_FLOOR_M = 1e-7
 PROPERTY_FLOOR = 0.05
 CLOCK_TOLERANCE = 1e-3
-VERTEX_ARRAYS = ("times", "controllers", "properties", "vertex_index", "vertices")
+VERTEX_ARRAYS = ("times", "controllers", "holding", "properties", "vertex_index", "vertices")
+Episode = TypeVar("Episode")
 
 
 @dataclass(frozen=True)
@@ -111,13 +113,13 @@ def has_vertices(spec: GraphSpec, arrays: dict[str, Array]) -> bool:
     return kept is not None and np.array_equal(kept[: spec.object_count], spec.particle_index)
 
 
-def split_tracks(tracks: list[Track], fraction: float, seed: int) -> tuple[list[Track], list[Track]]:
+def split_tracks(episodes: list[Episode], fraction: float, seed: int) -> tuple[list[Episode], list[Episode]]:
     """Training and validation episodes, whole; at least one of each, the same one when there is only one."""
-    if len(tracks) == 1:
-        return tracks, tracks
-    held_out = min(max(1, round(fraction * len(tracks))), len(tracks) - 1)
-    order = np.random.default_rng(seed).permutation(len(tracks))
-    return [tracks[i] for i in order[held_out:]], [tracks[i] for i in order[:held_out]]
+    if len(episodes) == 1:
+        return episodes, episodes
+    held_out = min(max(1, round(fraction * len(episodes))), len(episodes) - 1)
+    order = np.random.default_rng(seed).permutation(len(episodes))
+    return [episodes[i] for i in order[held_out:]], [episodes[i] for i in order[:held_out]]
 
 
 def measure_scales(

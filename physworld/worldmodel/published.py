@@ -16,7 +16,8 @@ none), ``vertex_spacing_m``, ``edge_radius_m``, ``object_vertices`` n, ``control
 the columns of Φ in their order, each with name, unit, whether it is logarithmic, whether the whole body shares it,
 and its root mean square over the training episodes; versions without the last have stiffness and density, both
 logarithms of ratios. ``strengths`` are the varied strengths, each with its unit, the range that was covered and where
-the version stands; none in versions without them.
+the version stands; none in versions without them. ``grips``: the controllers of each grip; ``holding``: the numbers
+of the grips that hold in this version (``physworld.worldmodel.holding``), null where all do, as in versions without it.
 
 A rollout starts with ``start.history`` and ``start.controllers``, or from rest: one frame h+1 times with
 still controllers. Its single-precision origin is the mean of the history's last frame; its z is the
@@ -64,6 +65,8 @@ class PublishedModel:
     start_time_s: float
     skin: Skin
     strengths: Conditioning | None = None
+    grips: tuple[tuple[int, ...], ...] = ()
+    holding: tuple[int, ...] | None = None
 
     @property
     def spec(self) -> GraphSpec:
@@ -201,6 +204,8 @@ class PublishedModel:
                 for one, spread in zip(self.columns, self.model.norm.properties, strict=True)
             ],
             "strengths": [] if self.strengths is None else self.strengths.facts(),
+            "grips": [list(own) for own in self.grips],
+            "holding": None if self.holding is None else list(self.holding),
         }
 
     @classmethod
@@ -269,6 +274,8 @@ class PublishedModel:
             start_time_s=float(tensors["start.time"][0]),
             skin=Skin(tensors["skin.index"], tensors["skin.weight"].astype(np.float64)),
             strengths=Conditioning.read(tensors, facts.get("strengths")),
+            grips=tuple(tuple(own) for own in facts.get("grips", ())),
+            holding=None if facts.get("holding") is None else tuple(facts["holding"]),
         )
 
 

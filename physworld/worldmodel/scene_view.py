@@ -46,6 +46,9 @@ class SceneView:
         history: h.
         twin_steps_per_second: ticks that the twin simulates in a second of computing.
         skin_error_m: mean distance between skinned and twin's own tracked points.
+        grips: the controllers of each grip.
+        holding: numbers of the grips whose controllers are vertices of the graph; None: all.
+        opens: whether a grip lets go in the recording.
     """
 
     scene: Scene
@@ -59,6 +62,14 @@ class SceneView:
     history: int
     twin_steps_per_second: float
     skin_error_m: float
+    grips: tuple[tuple[int, ...], ...] = ()
+    holding: tuple[int, ...] | None = None
+    opens: bool = False
+
+    @property
+    def as_recorded(self) -> bool:
+        """Whether the graph's grips are those that hold all through the recording: only then it shows the model's motion."""
+        return self.holding is None and not self.opens
 
     @property
     def start_history(self) -> Array:
@@ -72,11 +83,11 @@ class SceneView:
         return resample_smooth(ticks, self.times, self.scene.times - self.scene.times[0])
 
     def recording(self) -> Recording:
-        """The training frames for fine-tuning: those after the network's history."""
+        """The training frames for fine-tuning: those after the network's history, none where other grips hold."""
         ticks = (self.scene.times - self.scene.times[0]) / self.spec.dt_s - self.first
         begin, end = self.scene.train
         taken = np.arange(begin, end)
-        taken = taken[ticks[taken] > self.history]
+        taken = taken[(ticks[taken] > self.history) & self.as_recorded]
         return Recording(
             history=self.start_history,
             controllers=self.controllers[self.first :],
@@ -106,11 +117,24 @@ class SceneView:
             start_time_s=float(self.times[self.first]),
             skin=self.skin,
             strengths=strengths,
+            grips=self.grips,
+            holding=self.holding,
         )
 
 
-def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
-    """Simulate the twin on the recording's controllers and read it with the graph. Raises GraphInvalid."""
+def view_scene(
+    scene: Scene, twin: Twin, config: WorldModelConfig, holding: tuple[int, ...] | None = None
+) -> SceneView:
+    """Simulate the twin on the recording's controllers and read it with the graph. Raises GraphInvalid.
+
+    Args:
+        scene: the recording.
+        twin: calibrated on it.
+        config: of the graph.
+        holding: numbers of the grips that the graph is for; None: all, as in the recording.
+    """
+    if holding == tuple(range(len(twin.controller_groups))):
+        holding = None
     dt = model_dt(scene.fps)
     control_times, control_points = scene.control_track()
     times = clock_times(float(scene.times[-1] - scene.times[0]), dt)
@@ -130,6 +154,7 @@ def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
         dt_s=dt,
         config=config,
         control_groups=twin.controller_groups,
+        holding=holding,
         ground_height_m=twin.ground_height_m,
         gravity_m_s2=np.asarray(twin.gravity_m_s2),
     )
@@ -148,4 +173,7 @@ def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
         history=config.history,
         twin_steps_per_second=(len(times) - 1) / seconds,
         skin_error_m=float(np.linalg.norm(skin.apply(vertices) - tracks, axis=2).mean()),
+        grips=tuple(tuple(group.tolist()) for group in twin.controller_groups),
+        holding=holding,
+        opens=bool(twin.openings),
     )

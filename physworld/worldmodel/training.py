@@ -23,8 +23,9 @@ from __future__ import annotations
 import copy
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import chain
 from typing import Any
 
 import torch
@@ -113,14 +114,14 @@ _FIGURES = (
 
 
 def train(
-    tracks: list[Track],
+    tracks: Sequence[Track | Sequence[Track]],
     spec: GraphSpec,
     config: WorldModelConfig,
     training: TrainingConfig,
     *,
     columns: tuple[PhiColumn, ...] = PROPERTIES,
     total: int | None = None,
-    later: Callable[[int], Track] | None = None,
+    later: Callable[[int], Track | Sequence[Track]] | None = None,
     checkpoint: bytes | None = None,
     save_checkpoint: Callable[[bytes], None] | None = None,
     progress: Callable[[int, int, float], None] | None = None,
@@ -133,7 +134,8 @@ def train(
     """Train on ``tracks``; see the module's docstring.
 
     Args:
-        tracks: every episode, or the first :func:`first_episodes` of ``total`` when the others come ``later``.
+        tracks: every episode, or the first :func:`first_episodes` of ``total`` when the others come ``later``; of each
+            one track, or those of the parts of it that are learned from, perhaps none.
         spec: the graph.
         config: the network.
         training: steps, batches, rates, seed.
@@ -158,7 +160,12 @@ def train(
     if len(tracks) < (total if later is None else first):
         raise DatasetUnusable(f"{len(tracks)} of {total} episodes are here; the training begins with {first}")
     later = later or tracks.__getitem__
-    fitting, held_out = split_tracks(list(tracks[:first]), training.validation_fraction, training.seed)
+    known = [parts for episode in tracks[:first] if (parts := _parts(episode))]
+    if not known:
+        raise DatasetUnusable(f"the first {first} of {total} episodes have no part to train on")
+    learned, judged = split_tracks(known, training.validation_fraction, training.seed)
+    fitting, held_out = [*chain.from_iterable(learned)], [*chain.from_iterable(judged)]
+    used = len(known)
     h = config.history
     positions, phis = [track.positions.numpy() for track in fitting], [track.phi.numpy() for track in fitting]
     priors = fit_priors(positions, phis, spec, config, training.prior, training.frame)
@@ -192,7 +199,9 @@ def train(
             raise TrainingCancelled(run.step)
         present = episodes_at(run.step, first, total, training.steps)
         if present > joined:
-            fitting += [later(index) for index in range(joined, present)]
+            joining = [_parts(later(index)) for index in range(joined, present)]
+            fitting += chain.from_iterable(joining)
+            used += sum(map(bool, joining))
             sampler, joined = WindowSampler(fitting), present
         longest = max(sampler.lengths) - config.history - 1
         _train_step(run, sampler, training, min(training.look_ahead, longest))
@@ -217,7 +226,7 @@ def train(
         static_error_m=mean_error([_static(track, config.history) for track in held_out], held_out, spec),
         steps=run.step,
         steps_left_out=run.left_out,
-        episodes=joined,
+        episodes=used,
     )
 
 
@@ -237,6 +246,11 @@ def episodes_at(step: int, first: int, total: int, steps: int) -> int:
     """
     share = min(1.0, step / max(1.0, JOIN_SHARE * steps))
     return first + math.floor((total - first) * math.floor(share * JOIN_BATCHES) / JOIN_BATCHES)
+
+
+def _parts(episode: Track | Sequence[Track]) -> Sequence[Track]:
+    """What is learned from of an episode."""
+    return [episode] if isinstance(episode, Track) else episode
 
 
 def open_loop_error(model: WorldModel, tracks: list[Track]) -> float:

@@ -165,8 +165,8 @@ def _input(
     if own.get("type") == "array" and "enum" in own.get("items", {}):
         listed = [(str(item), str(item).replace("_", " ")) for item in own["items"]["enum"]]
         return Input(kind="choices", options=listed, **known)
-    if own.get("type") == "array" and own.get("items", {}).get("type") == "string":
-        return Input(kind="words", **{**known, "value": ", ".join(value or ())})
+    if own.get("type") == "array" and own.get("items", {}).get("type") in {"string", "integer"}:
+        return Input(kind="words", **{**known, "value": ", ".join(map(str, value or ()))})
     if own.get("type") == "object" and "enum" in own.get("propertyNames", {}):
         listed = [(str(item), str(item).replace("_", " ")) for item in own["propertyNames"]["enum"]]
         return Input(kind="weights", options=listed, least=0.0, **{**known, "value": value or {}})
@@ -196,13 +196,14 @@ def _read(schema: Schema, root: Schema, name: str, sent: Mapping[str, Sequence[s
         if nested is not None:
             body[key] = _read(nested, root, place, sent)
             continue
-        own, _ = _without_null(described)
+        own, optional = _without_null(described)
         texts = [text.strip() for text in sent.get(place, ())]
         if own.get("type") == "boolean":
             body[key] = bool(texts)
         elif own.get("type") == "array":
             listed = texts if len(texts) != 1 else [part.strip() for part in texts[0].split(",")]
-            body[key] = [text for text in listed if text]
+            if any(listed) or not optional:
+                body[key] = [text for text in listed if text]
         elif own.get("type") == "object":
             weights = {
                 text: sent[f"{place}.{text}"][0].strip()

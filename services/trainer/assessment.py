@@ -118,7 +118,7 @@ def assess(
     if not np.isfinite(promised).any():
         raise SceneUnsupported(
             f"version {version.version} of {version.name} has no error of its own on held-out frames to compare with: "
-            "its prediction left the numbers there, or nothing was visible"
+            "its prediction left the numbers there, nothing was visible, or it is for other grips than hold there"
         )
     floors = (_floor(recording), version.metrics.get("noise_floor_m"))
     comparison = compare(errors, floors[0], np.array(promised), floors[1])

@@ -15,7 +15,8 @@ import numpy as np
 
 from physworld.demonstrate.config import StrengthRange
 from physworld.demonstrate.perturbation import BOUND_SIGMAS
-from physworld.worldmodel.dataset import VERTEX_ARRAYS, Track, has_vertices, read_track
+from physworld.worldmodel.dataset import VERTEX_ARRAYS, Track, has_vertices
+from physworld.worldmodel.holding.spans import Grips, every_grip, held_tracks
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.properties import FRICTION, PROPERTIES, PhiColumn
 from physworld_schemas.base import Reference
@@ -50,6 +51,9 @@ class Episodes:
     Attributes:
         total: how many there are, or will be.
         columns: of Φ: the properties, the ground's friction and the effects' strengths if the episodes differ in them.
+        grip_count: G, of the twin.
+        grips: that hold in the parts of the episodes that are read.
+        lets_go: whether an episode that was read says which grips hold, so that parts of it are learned from.
         reached: steps taken and to take, for the progress while it waits.
 
     Args:
@@ -61,6 +65,8 @@ class Episodes:
         strengths: intervals of the twin's effects, of which each becomes a column of Φ.
         ground_friction: calibrated coefficient; None without a ground.
         units: of the strengths, by the names of their columns.
+        grip_count: G.
+        grips: that hold; None: all.
     """
 
     def __init__(
@@ -73,9 +79,12 @@ class Episodes:
         strengths: Sequence[StrengthRange] = (),
         ground_friction: float | None = None,
         units: Mapping[str, str] | None = None,
+        grip_count: int = 0,
+        grips: Grips | None = None,
     ) -> None:
         self._context, self._stores, self._dataset_id = context, stores, dataset_id
         self._spec, self._history = spec, history
+        self.grip_count, self.grips = grip_count, every_grip(grip_count) if grips is None else grips
         dataset = self._dataset()
         self.total = dataset.config.episodes
         perturbed = dataset.config.effects != "as_found"
@@ -93,9 +102,14 @@ class Episodes:
         own = (column_of(one, units.get(f"{one.effect}.{one.name}", "")) for one in varied)
         self.columns = (*PROPERTIES, *friction, *own)
         self.reached = (0, 1)
+        self.lets_go = False
 
-    def track(self, index: int) -> Track:
-        """Episode ``index`` once it is there. Raises Cancelled, LeaseLost, DatasetIncomplete or EpisodeCorrupt."""
+    def tracks(self, index: int) -> list[Track]:
+        """The parts of episode ``index`` in which exactly the grips hold, once it is there.
+
+        Raises:
+            Cancelled, LeaseLost, DatasetIncomplete, EpisodeCorrupt, DatasetUnusable: what stands in the way.
+        """
         while (episode := self._committed(index)) is None:
             if self._dataset().state in {"failed", "cancelled", "sealed"}:
                 raise DatasetIncomplete(
@@ -115,7 +129,9 @@ class Episodes:
             for one in self.columns
             if one.calibrated is not None
         }
-        return read_track(self._spec, arrays, self._history, self.columns, values)
+        self.lets_go |= "holding" in arrays
+        own = (self.grips, self.grip_count, self._history)
+        return held_tracks(self._spec, arrays, *own, self.columns, values)
 
     def tuned(self, strengths: Mapping[str, float]) -> dict[str, Any]:
         """What fine-tuning chose of the shared columns, in physical units beside what the calibration said."""

@@ -46,6 +46,8 @@ def measure(
 ) -> Measured:
     """Open-loop predictions over the whole recording, and what they cost.
 
+    A version for other grips than hold in the recording is not in the table: it predicts another motion.
+
     Args:
         view: the recording at the model's vertices.
         published: the version.
@@ -64,7 +66,9 @@ def measure(
     frame_times = view.scene.times - view.scene.times[0]
     tracks, tracks_calibrated = view.tracks_of(rolled), view.tracks_of(calibrated)
     twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)
-    predictions = {"twin": twin_tracks, "world_model": tracks_calibrated, "world_model_finetuned": tracks}
+    predictions = {"twin": twin_tracks}
+    if view.as_recorded:
+        predictions |= {"world_model": tracks_calibrated, "world_model_finetuned": tracks}
     finite = {name: path for name, path in predictions.items() if np.isfinite(path).all()}
     poll(SPEED_REPEATS + 1, RUNS)
     table = _with_intervals(held_out_table(view.scene, finite))

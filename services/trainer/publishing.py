@@ -75,11 +75,18 @@ def card_of(
             "open loop, at the time step of the model."
         ),
         "limits": (
-            f"One object and its grips, as recorded: {_SEEN[config.near_edges]}fracture, flow and other grips are not "
-            "represented; motions much faster or wider than the demonstrations are extrapolated; the start needs "
+            f"One object and {_grips_said(published)}: {_SEEN[config.near_edges]}fracture, flow and other grips are "
+            "not represented; motions much faster or wider than the demonstrations are extrapolated; the start needs "
             f"{config.history + 1} frames."
         ),
     }
+
+
+def _grips_said(published: PublishedModel) -> str:
+    """Which grips the version is for."""
+    if published.holding is None:
+        return "its grips, as recorded"
+    return f"of its {len(published.grips)} grips, from 0, only {list(published.holding)}"
 
 
 def model_of(stores: Stores, version: ModelVersion) -> PublishedModel:

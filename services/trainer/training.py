@@ -3,7 +3,10 @@
 Reads the episodes (``physworld_services.trainer.episodes``), trains with a checkpoint every few hundred steps, kept in
 the scratch store (a killed trainer, or another one in its place, carries on from the last one), fine-tunes the
 properties on the recording's training frames, measures everything open loop on the frames that were held out, and
-stores the version's files:
+stores the version's files. A version for grips that do not hold alone in the recording has nothing there to be tuned on
+or measured by: its card has the validation on the demonstrations.
+
+The files:
 
 * ``model.safetensors``: see ``physworld.worldmodel.model.model`` and ``.published``;
 * ``step.pt2``, ``step.onnx``: one step as a program (``physworld.worldmodel.export``);
@@ -20,6 +23,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,8 +31,9 @@ import numpy as np
 from physworld.demonstrate.config import StrengthRange
 from physworld.demonstrate.properties import ranges_of
 from physworld.devices import torch_device
-from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
+from physworld.worldmodel.errors import CheckpointMismatch, DatasetUnusable, TrainingCancelled
 from physworld.worldmodel.finetune import FineTuneResult, fine_tune
+from physworld.worldmodel.holding.spans import look_ahead_for
 from physworld.worldmodel.model import config as settings_of
 from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.model import WorldModel
@@ -69,7 +74,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
     context.plan(stages_of(config))
     context.begin(READING)
-    view = view_scene(scene, twin, architecture)
+    view = view_scene(scene, twin, architecture, None if config.holding is None else tuple(config.holding))
     strengths = _strengths(stores, payload)
     episodes = Episodes(
         context,
@@ -80,6 +85,8 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         strengths,
         None if twin.ground_height_m is None else twin.ground_friction,
         {f"{one.name}.{part.name}": part.unit for one in twin.effects for part in type(one).strengths(twin)},
+        len(view.grips),
+        view.holding,
     )
     started = time.perf_counter()
     start = _start(stores, config)
@@ -185,7 +192,16 @@ def _train(
     """Train, from the checkpoint of an earlier attempt where there is one."""
     job_id = context.lease.job_id
     first = first_episodes(episodes.total, training.start_share)
-    tracks = [episodes.track(index) for index in range(first)]
+    tracks = [episodes.tracks(index) for index in range(first)]
+    spans = [track for parts in tracks for track in parts]
+    if not spans:
+        raise DatasetUnusable(
+            f"in none of the {first} episodes that the training begins with the grips {list(episodes.grips)}, and no "
+            f"other of {episodes.grip_count}, hold for a step or more"
+        )
+    if episodes.lets_go:
+        ahead = look_ahead_for(spans, architecture.history, training.look_ahead)
+        training = replace(training, look_ahead=ahead)
 
     device = torch_device(stores.settings.device)
     logger.info("job %s trains on %s", job_id, device)
@@ -216,7 +232,7 @@ def _train(
             training,
             columns=episodes.columns,
             total=episodes.total,
-            later=episodes.track,
+            later=episodes.tracks,
             checkpoint=checkpoint,
             save_checkpoint=lambda data: stores.scratch.put(job_id, CHECKPOINT, data),
             progress=progress,
@@ -288,5 +304,7 @@ def _metrics(
         "skin_error_m": view.skin_error_m,
         "world_model_against_twin_m": float(
             np.linalg.norm(measured.tracks_calibrated - measured.twin_tracks, axis=2).mean()
-        ),
+        )
+        if view.as_recorded
+        else None,
     }

@@ -136,6 +136,7 @@ def build_graph(
     dt_s: float,
     config: WorldModelConfig,
     control_groups: tuple[Array, ...] = (),
+    holding: tuple[int, ...] | None = None,
     ground_height_m: float | None = None,
     gravity_m_s2: Array | None = None,
 ) -> GraphSpec:
@@ -148,6 +149,7 @@ def build_graph(
         dt_s: the model's clock [s].
         config: number of vertices and neighbours.
         control_groups: controllers that move as one rigid grip.
+        holding: numbers of the groups that hold the body; the others' controllers are no vertices. None: all hold.
         ground_height_m: height of the ground plane, or None.
         gravity_m_s2: (3,); with it the graph has a grip's frame, unless there is a ground or NEAR edges are found anew.
     """
@@ -163,6 +165,7 @@ def build_graph(
 
     controllers = np.asarray(controllers_start, dtype=np.float64)
     control = choose_control_vertices(controllers, control_groups, config)
+    control = control[~np.isin(control, _of_open_grips(control_groups, holding))]
     start = np.asarray(particles_start, dtype=np.float64)[index]
     vertex_count = n + len(control)
     kind = np.full((vertex_count, vertex_count), -1)
@@ -198,6 +201,18 @@ def build_graph(
         current_neighbours=0 if material else nearest,
         frame=grip_frame(controllers[control], np.asarray(gravity_m_s2), dt_s) if framed else None,
     )
+
+
+def _of_open_grips(groups: tuple[Array, ...], holding: tuple[int, ...] | None) -> Array:
+    """Controllers of the groups that are not among ``holding``; none where all hold. Raises GraphInvalid."""
+    if holding is None:
+        return np.zeros(0, dtype=np.int64)
+    if not holding or len(set(holding)) < len(holding) or not set(holding) <= set(range(len(groups))):
+        raise GraphInvalid(
+            f"grips {list(holding)} hold: at least one, and each once, of the {len(groups)} that there are, from 0"
+        )
+    opened = [np.asarray(group) for number, group in enumerate(groups) if number not in holding]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *opened])
 
 
 def _near_links(distances: Array, neighbours: int, radius: float) -> Array:
