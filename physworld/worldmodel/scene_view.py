@@ -68,7 +68,7 @@ class SceneView:
 
     @property
     def as_recorded(self) -> bool:
-        """Whether the graph's grips are those that hold all through the recording: only then it shows the model's motion."""
+        """Whether the graph's grips hold all through the recording, so that it shows what the model should do."""
         return self.holding is None and not self.opens
 
     @property
