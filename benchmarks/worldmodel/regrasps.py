@@ -13,6 +13,7 @@ Episodes are made once and kept in ``--cells``.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from collections.abc import Callable
@@ -49,7 +50,7 @@ Made = dict[str, Array]
 def main() -> int:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.worldmodel.regrasps", description=__doc__)
-    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--json", type=Path, required=True, help="bodies in it are not trained again")
     parser.add_argument("--docs", type=Path, help="a page whose section is replaced")
     parser.add_argument("--cells", type=Path, default=CELLS, help="keeps the episodes")
     parser.add_argument("--bodies", nargs="*", default=[*BODIES], choices=[*BODIES])
@@ -57,8 +58,12 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=600, help="of each training")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [cell(name, given.cells, given.taught, given.steps) for name in given.bodies]
-    report = report_of(rows, given.taught)
+    known = json.loads(given.json.read_text())["bodies"] if given.json.exists() else []
+    rows = {row["body"]: row for row in known}
+    for name in given.bodies:
+        if name not in rows:
+            rows[name] = cell(name, given.cells, given.taught, given.steps)
+    report = report_of([rows[name] for name in BODIES if name in rows], given.taught)
     print(report.markdown())
     write_json(report, given.json)
     if given.docs is not None:

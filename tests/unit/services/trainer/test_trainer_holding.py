@@ -163,6 +163,8 @@ def test_one_dataset_gives_a_version_for_each_set_of_grips(
 
     table = left.metrics["held_out"]["track_m"]
     assert "world_model_finetuned" in both.metrics["held_out"]["track_m"]
+    assert both.metrics["judged_on_recording"] and not left.metrics["judged_on_recording"]
+    assert both.metrics["notes"] == [] and "Other grips hold" in left.metrics["notes"][0]
     assert not {"world_model", "world_model_finetuned"} & set(table) and table["twin"] > 0.0
     assert left.metrics["world_model_against_twin_m"] is None and left.metrics["fine_tuning"]["steps"] == 0
     assert left.quality.metric is None and left.metrics["validation"]["open_loop_m"] > 0.0
