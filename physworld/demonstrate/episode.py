@@ -209,6 +209,10 @@ def run_episode(twin: Twin, plan: EpisodePlan, progress: Progress | None = None)
     if not plan.opens:
         return episode_arrays(plan, own.particles_at(moved))
     held = holding(own, plan.times)
+    if not any(plan.openings):
+        held[:, [not len(nodes) for nodes in own.held_nodes]] = (
+            0  # open at the start, and all through this motion
+        )
     plan = replace(plan, controllers=along_with_the_material(own, plan.controllers, moved, held))
     return {**episode_arrays(plan, own.particles_at(moved)), "holding": held}
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.scene import Scene
+from physworld.twin.openings import holding as held_at
 from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import clock_times, model_dt, resample, resample_smooth
 from physworld.worldmodel.errors import GraphInvalid
@@ -48,7 +49,7 @@ class SceneView:
         skin_error_m: mean distance between skinned and twin's own tracked points.
         grips: the controllers of each grip.
         holding: numbers of the grips whose controllers are vertices of the graph; None: all.
-        opens: whether a grip lets go in the recording.
+        held: which grips hold in the recording from each tick to the next, (T, G), where one lets go; else None.
     """
 
     scene: Scene
@@ -64,12 +65,12 @@ class SceneView:
     skin_error_m: float
     grips: tuple[tuple[int, ...], ...] = ()
     holding: tuple[int, ...] | None = None
-    opens: bool = False
+    held: Array | None = None
 
     @property
     def as_recorded(self) -> bool:
         """Whether the graph's grips hold all through the recording, so that it shows what the model should do."""
-        return self.holding is None and not self.opens
+        return self.holding is None and self.held is None
 
     @property
     def start_history(self) -> Array:
@@ -175,5 +176,5 @@ def view_scene(
         skin_error_m=float(np.linalg.norm(skin.apply(vertices) - tracks, axis=2).mean()),
         grips=tuple(tuple(group.tolist()) for group in twin.controller_groups),
         holding=holding,
-        opens=bool(twin.openings),
+        held=held_at(twin, times + scene.times[0]) if twin.openings else None,
     )

@@ -16,6 +16,7 @@ from physworld.evaluate.metrics import metrics
 from physworld.evaluate.table import held_out_table
 from physworld.worldmodel.clock import resample_smooth
 from physworld.worldmodel.energy import still_energy
+from physworld.worldmodel.holding.rollout import HeldVersions
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView
 
@@ -43,16 +44,20 @@ def measure(
     published: PublishedModel,
     before: PublishedModel | None = None,
     poll: Callable[[int, int], None] = lambda done, of: None,
+    held: HeldVersions | None = None,
 ) -> Measured:
     """Open-loop predictions over the whole recording, and what they cost.
 
-    A version for other grips than hold in the recording is not in the table: it predicts another motion.
+    A version for other grips than hold in the recording is not in the table: it predicts another motion. Where grips
+    let go, versions for each set of them predict it together.
 
     Args:
         view: the recording at the model's vertices.
         published: the version.
         before: it without fine-tuned strengths; None: there are none.
         poll: called between rollouts with (done, of); it raises to end the measurement.
+        held: the versions for every set of grips that holds in the recording; None: one holds all through, or some set
+            has none.
     """
     controllers = view.controllers[view.first :]
     seconds = []
@@ -63,11 +68,13 @@ def measure(
         seconds.append(time.perf_counter() - started)
     poll(SPEED_REPEATS, RUNS)
     calibrated = (before or published).rollout(controllers, phi=published.phi_calibrated)
+    if held is not None and view.held is not None:
+        rolled = calibrated = held.rollout(controllers, view.held[view.first :])
     frame_times = view.scene.times - view.scene.times[0]
     tracks, tracks_calibrated = view.tracks_of(rolled), view.tracks_of(calibrated)
     twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)
     predictions = {"twin": twin_tracks}
-    if view.as_recorded:
+    if view.as_recorded or held is not None:
         predictions |= {"world_model": tracks_calibrated, "world_model_finetuned": tracks}
     finite = {name: path for name, path in predictions.items() if np.isfinite(path).all()}
     poll(SPEED_REPEATS + 1, RUNS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -82,6 +82,14 @@ def card_of(
     }
 
 
+def held_of(members: Sequence[PublishedModel]) -> list[dict[str, Any]]:
+    """``held`` of a card: the models for other sets of grips that are published with a version."""
+    return [
+        {"grips": list(one.holding or ()), "file": f"held_{number}.safetensors", "architecture": one.facts()}
+        for number, one in enumerate(members)
+    ]
+
+
 def _grips_said(published: PublishedModel) -> str:
     """Which grips the version is for."""
     if published.holding is None:
@@ -105,6 +113,7 @@ def store_version(
     measured: Measured,
     card: dict[str, Any],
     begin: Callable[[str], None] = lambda name: None,
+    members: Sequence[PublishedModel] = (),
 ) -> list[Artifact]:
     """The version's files, the manifest and its signature last.
 
@@ -116,6 +125,7 @@ def store_version(
         measured: its predictions.
         card: what it says of itself.
         begin: called before each program with its format; it raises to end the export.
+        members: the models for other sets of grips, which go with it (``held`` of the card).
     """
     put = stores.artifacts.put_bytes
     prediction = {
@@ -135,6 +145,10 @@ def store_version(
         )
     artifacts = [
         put(save_tensors(published.to_tensors(), facts), WEIGHTS_NAME, "application/octet-stream"),
+        *(
+            put(save_tensors(one.to_tensors(), facts), part["file"], "application/octet-stream")
+            for one, part in zip(members, card.get("held", []), strict=True)
+        ),
         *programs,
         put(json.dumps(card, indent=1, allow_nan=False).encode(), "card.json", "application/json"),
         put(npz_bytes(prediction), "prediction.npz", "application/x-npz"),

@@ -3,12 +3,14 @@
 Reads the episodes (``physworld_services.trainer.episodes``), trains with a checkpoint every few hundred steps, kept in
 the scratch store (a killed trainer, or another one in its place, carries on from the last one), fine-tunes the
 properties on the recording's training frames, measures everything open loop on the frames that were held out, and
-stores the version's files. A version for grips that do not hold alone in the recording has nothing there to be tuned on
-or measured by: its card has the validation on the demonstrations.
+stores the version's files. Where a grip lets go in the recording, a model for each other set of grips is trained and
+published with the version, and all of them together are measured; nothing is fine-tuned. A version that was asked for a
+set of grips has nothing there to be measured by: its card has the validation on the demonstrations.
 
 The files:
 
-* ``model.safetensors``: see ``physworld.worldmodel.model.model`` and ``.published``;
+* ``model.safetensors``: see ``physworld.worldmodel.model.model`` and ``.published``; ``held_0.safetensors`` …: the same
+  of the models for other sets of grips, which ``held`` of the card names;
 * ``step.pt2``, ``step.onnx``: one step as a program (``physworld.worldmodel.export``);
 * ``card.json``: lineage, architecture, metrics, seeds, versions, intended use, limits;
 * ``prediction.npz``: ``times`` (T,) f8 [s], ``tracks`` and ``tracks_calibrated`` (T, N, 3) f4 [m] after and
@@ -22,8 +24,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,9 +34,14 @@ import numpy as np
 from physworld.demonstrate.config import StrengthRange
 from physworld.demonstrate.properties import ranges_of
 from physworld.devices import torch_device
+from physworld.scene import Scene
+from physworld.twin.openings import holding
+from physworld.twin.twin import Twin
+from physworld.worldmodel.clock import clock_times, model_dt
 from physworld.worldmodel.errors import CheckpointMismatch, DatasetUnusable, TrainingCancelled
 from physworld.worldmodel.finetune import FineTuneResult, fine_tune
-from physworld.worldmodel.holding.spans import look_ahead_for
+from physworld.worldmodel.holding.rollout import HeldVersions
+from physworld.worldmodel.holding.spans import Grips, every_grip, look_ahead_for, sets_of
 from physworld.worldmodel.model import config as settings_of
 from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.model import WorldModel
@@ -45,7 +53,7 @@ from physworld_schemas.quality import quality_of
 from physworld_services.trainer.closed_loop import closed_loop
 from physworld_services.trainer.episodes import Episodes
 from physworld_services.trainer.measuring import Measured, json_safe, measure
-from physworld_services.trainer.publishing import MANIFEST_NAME, card_of, model_of, store_version
+from physworld_services.trainer.publishing import MANIFEST_NAME, card_of, held_of, model_of, store_version
 from physworld_services.trainer.settings import translate
 from physworld_storage import registry, traces
 from physworld_workers.context import HandlerResult, TaskContext
@@ -76,22 +84,22 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     architecture, training, tuning = translate(config)
     scene = scene_of(stores, payload["scene_id"])
     twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
-    context.plan(stages_of(config))
+    others = _other_sets(scene, twin) if config.holding is None else []
+    context.plan(stages_of(config, others))
     context.begin(READING)
-    view = view_scene(scene, twin, architecture, None if config.holding is None else tuple(config.holding))
     strengths = _strengths(stores, payload)
-    episodes = Episodes(
-        context,
-        stores,
-        payload["dataset_id"],
-        view.spec,
-        architecture.history,
-        strengths,
-        None if twin.ground_height_m is None else twin.ground_friction,
-        {f"{one.name}.{part.name}": part.unit for one in twin.effects for part in type(one).strengths(twin)},
-        len(view.grips),
-        view.holding,
-    )
+
+    def seen_by(grips: Grips | None) -> tuple[SceneView, Episodes]:
+        """The recording and the episodes as a model of these grips sees them; None: of all."""
+        view = view_scene(scene, twin, architecture, grips)
+        units = {
+            f"{one.name}.{part.name}": part.unit for one in twin.effects for part in type(one).strengths(twin)
+        }
+        friction = None if twin.ground_height_m is None else twin.ground_friction
+        facts = (architecture.history, strengths, friction, units, len(view.grips), view.holding)
+        return view, Episodes(context, stores, payload["dataset_id"], view.spec, *facts)
+
+    view, episodes = seen_by(None if config.holding is None else tuple(config.holding))
     started = time.perf_counter()
     start = _start(stores, config)
     network = None if start is None else model_of(stores, start).model
@@ -115,7 +123,6 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         ),
     )
     tuning_s = time.perf_counter() - started
-    context.begin(MEASURING)
     covered = {f"{one.effect}.{one.name}": (one.low, one.high) for one in ranges_of(twin, strengths)}
     published = view.published(
         trained.model.at_strengths(tuned.strengths),
@@ -125,9 +132,18 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     )
     untuned = trained.model.at_strengths(dict.fromkeys(tuned.strengths, 0.0))
     before = view.published(untuned, phi, phi)
-    measured = measure(view, published, before, _poll(context, "runs", MEASURING))
+    members = []
+    for grips in others:
+        seen, parts = seen_by(grips)
+        own = _train(context, stores, parts, seen, architecture, training, network, grips).model
+        members.append(seen.published(own.at_strengths(dict.fromkeys(tuned.strengths, 0.0)), phi, phi))
+    held = HeldVersions.of([published, *members]) if members else None
+    context.begin(MEASURING)
+    measured = measure(view, published, before, _poll(context, "runs", MEASURING), held)
     seconds = {"training": training_s, "fine_tuning": tuning_s}
-    metrics = json_safe(_metrics(view, trained, tuned, measured, seconds))
+    metrics = json_safe(
+        _metrics(view, trained, tuned, measured, seconds, view.as_recorded or held is not None)
+    )
     metrics["fine_tuning"]["strengths"] = json_safe(episodes.tuned(tuned.strengths))
     metrics["closed_loop"] = json_safe(closed_loop(stores, payload, metrics, architecture))
     dataset = episodes.sealed()
@@ -136,10 +152,10 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         sources.append(Reference(kind="model", id=str(config.start_from), digest=start.sha256))
     lineage = lineage_of(sources, payload["config"], {"training": config.seed})
     card = card_of(payload, config, published, metrics, lineage) | {"trained_on": episodes.description()}
+    card["held"] = held_of(members)
     card["quality"] = quality_of(metrics).model_dump(mode="json")
-    artifacts = store_version(
-        stores, payload, published, view, measured, card, lambda name: context.begin(f"{EXPORTING} {name}")
-    )
+    begin_export = partial(_begin_export, context)
+    artifacts = store_version(stores, payload, published, view, measured, card, begin_export, members)
     manifest = next(artifact for artifact in artifacts if artifact.name == MANIFEST_NAME)
     context.check()
     result = {
@@ -151,7 +167,20 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     return HandlerResult(result, manifest.sha256)
 
 
-def stages_of(config: TrainingConfig) -> dict[str, float]:
+def _begin_export(context: TaskContext, name: str) -> None:
+    context.begin(f"{EXPORTING} {name}")
+
+
+def _other_sets(scene: Scene, twin: Twin) -> list[Grips]:
+    """Sets of grips that hold in a recording, beside all of them; none where at times nothing holds."""
+    if not twin.openings:
+        return []
+    times = clock_times(float(scene.times[-1] - scene.times[0]), model_dt(scene.fps)) + scene.times[0]
+    sets = sets_of(holding(twin, times))
+    return [grips for grips in sets if grips != every_grip(len(twin.controller_groups))] if all(sets) else []
+
+
+def stages_of(config: TrainingConfig, others: Sequence[Grips] = ()) -> dict[str, float]:
     """The stages of a training and about how long each takes [s], of which only the ratios count.
 
     Medians of the trainings that ``benchmarks.service.time_left`` runs on the sample scene, on a busy machine (ADR 66).
@@ -161,6 +190,14 @@ def stages_of(config: TrainingConfig) -> dict[str, float]:
         PRIORS: 0.15 * config.vertices,
         TRAINING: 0.0177 * config.hidden * config.steps,
         FINE_TUNING: 0.0042 * config.hidden * config.fine_tune_steps,
+        **{
+            of_grips(stage, grips): seconds
+            for grips in others
+            for stage, seconds in (
+                (PRIORS, 0.15 * config.vertices),
+                (TRAINING, 0.0177 * config.hidden * config.steps),
+            )
+        },
         MEASURING: 0.5,
         **{f"{EXPORTING} {name}": EXPORT_S[name] for name in config.formats},
     }
@@ -192,9 +229,11 @@ def _train(
     architecture: settings_of.WorldModelConfig,
     training: settings_of.TrainingConfig,
     start: WorldModel | None,
+    grips: Grips | None = None,
 ) -> TrainingResult:
-    """Train, from the checkpoint of an earlier attempt where there is one."""
+    """Train, from the checkpoint of an earlier attempt where there is one; ``grips``: for another set of them."""
     job_id = context.lease.job_id
+    kept = CHECKPOINT if grips is None else f"grips-{'-'.join(map(str, grips))}-{CHECKPOINT}"
     first = first_episodes(episodes.total, training.start_share)
     tracks = [episodes.tracks(index) for index in range(first)]
     spans = [track for parts in tracks for track in parts]
@@ -209,13 +248,13 @@ def _train(
 
     device = torch_device(stores.settings.device)
     logger.info("job %s trains on %s", job_id, device)
-    context.begin(PRIORS)
+    context.begin(of_grips(PRIORS, grips))
     latest: dict[str, float] = {}
 
     def begin_training() -> None:
         """The priors are fitted once the network is validated for the first time, or trains on from a checkpoint."""
         if not latest:
-            context.begin(TRAINING, "steps", training.steps)
+            context.begin(of_grips(TRAINING, grips), "steps", training.steps)
 
     def progress(step: int, steps: int, loss: float) -> None:
         begin_training()
@@ -238,7 +277,7 @@ def _train(
             total=episodes.total,
             later=episodes.tracks,
             checkpoint=checkpoint,
-            save_checkpoint=lambda data: stores.scratch.put(job_id, CHECKPOINT, data),
+            save_checkpoint=lambda data: stores.scratch.put(job_id, kept, data),
             progress=progress,
             validated=validated,
             cancelled=context.cancelled,
@@ -247,10 +286,15 @@ def _train(
         )
 
     try:
-        return _stopping(context, lambda: attempt(stores.scratch.get(job_id, CHECKPOINT)))
+        return _stopping(context, lambda: attempt(stores.scratch.get(job_id, kept)))
     except CheckpointMismatch as mismatch:
         logger.warning("job %s starts anew: %s", job_id, mismatch)
         return _stopping(context, lambda: attempt(None))
+
+
+def of_grips(name: str, grips: Grips | None) -> str:
+    """A stage of the model for a set of grips that is trained beside the version's own."""
+    return name if grips is None else f"{name}, grips {' '.join(map(str, grips))}"
 
 
 def _poll(context: TaskContext, unit: str, message: str) -> Callable[[int, int], None]:
@@ -278,11 +322,12 @@ def _metrics(
     tuned: FineTuneResult,
     measured: Measured,
     seconds: dict[str, float],
+    judged: bool,
 ) -> dict[str, Any]:
-    notes = [] if view.as_recorded else [OTHER_GRIPS]
+    notes = [] if judged else [OTHER_GRIPS]
     return {
         "held_out": measured.table,
-        "judged_on_recording": view.as_recorded,
+        "judged_on_recording": judged,
         "notes": notes,
         "energy": measured.energy,
         "steps_per_second": measured.steps_per_second,
@@ -312,6 +357,6 @@ def _metrics(
         "world_model_against_twin_m": float(
             np.linalg.norm(measured.tracks_calibrated - measured.twin_tracks, axis=2).mean()
         )
-        if view.as_recorded
+        if judged
         else None,
     }

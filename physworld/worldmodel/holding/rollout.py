@@ -9,11 +9,14 @@ stay as they are. Grips that close do it on the material where it was predicted
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
+from safetensors.numpy import load_file
 
 from physworld.arrays import Array
 from physworld.worldmodel.errors import ControlsInvalid, GraphInvalid
@@ -191,6 +194,25 @@ class HeldVersions:
         groups = tuple(np.array(own, dtype=np.int64) for grips in named for own in grips)
         models = HeldModels({grips: one.model for grips, one in by_grips.items()}, groups)
         return cls(models, {grips: one.phi for grips, one in by_grips.items()}, versions[0].start_history)
+
+    @classmethod
+    def published(cls, folder: Path) -> HeldVersions:
+        """The versions that a training of a recording in which grips let go published together.
+
+        Args:
+            folder: of a downloaded version: ``card.json``, ``model.safetensors`` and the files of ``card["held"]``.
+
+        Raises:
+            VersionUnreadable: a part of another layout.
+        """
+        card = json.loads((folder / "card.json").read_text())
+        parts = [{"file": "model.safetensors", "architecture": card["architecture"]}, *card.get("held", [])]
+        return cls.of(
+            [
+                PublishedModel.from_tensors(load_file(folder / part["file"]), part["architecture"])
+                for part in parts
+            ]
+        )
 
     def rollout(
         self, controllers: Array, holding: Array, *, history: Array | None = None, take_hold: bool = True

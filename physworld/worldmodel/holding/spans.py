@@ -58,6 +58,11 @@ def spans_of(holding: Array) -> list[Span]:
     return [Span(grips, *ends) for grips, ends in zip(sets, pairwise(bounds), strict=False)]
 
 
+def sets_of(holding: Array) -> list[Grips]:
+    """The sets of grips that hold at some step of ``holding`` (T, G), in the order in which they first do."""
+    return list(dict.fromkeys(span.grips for span in spans_of(holding)))
+
+
 def held_tracks(
     spec: GraphSpec,
     arrays: dict[str, Array],
