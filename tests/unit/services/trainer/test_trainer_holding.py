@@ -190,3 +190,44 @@ def test_grips_are_named_once_and_in_order() -> None:
     for wrong in ([], [1, 1], [-1]):
         with pytest.raises(ValidationError):
             TrainingConfig(holding=wrong)
+
+
+def test_a_recording_in_which_a_grip_lets_go_gives_one_version_that_follows_it(
+    runtime: Runtime, tmp_path: Path
+) -> None:
+    scene, fps = two_grips(), 30.0
+    far = dataclasses.replace(scene.grips[1], open_s=((OPENED / fps, CLOSED / fps),))
+    scene_id = register(
+        dataclasses.replace(scene, grips=(scene.grips[0], far)), runtime.database, runtime.stores.artifacts
+    )
+    with runtime.database.session() as session:
+        fit = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=2))
+    _drain(runtime)
+    with runtime.database.session() as session:
+        settings = DatasetConfig(episodes=6, replay_share=0.5)
+        dataset = jobs.create_dataset(session, fit.outputs[0].id, settings).outputs[0].id
+    _drain(runtime)
+    version = _train(runtime, dataset, "caught", None)
+    assert version.state == "ready", version.message
+    table = version.metrics["held_out"]["track_m"]
+    assert version.metrics["judged_on_recording"] and version.metrics["notes"] == []
+    assert table["world_model"] == table["world_model_finetuned"] > 0.0
+
+    for item in version.artifacts:
+        (tmp_path / item.name).write_bytes(runtime.stores.artifacts.read_bytes(item.sha256))
+    card = json.loads((tmp_path / "card.json").read_text())
+    assert [(part["grips"], part["file"]) for part in card["held"]] == [([0], "held_0.safetensors")]
+    versions = HeldVersions.published(tmp_path)
+    assert set(versions.models.members) == {(0, 1), (0,)}
+    with np.load(tmp_path / "prediction.npz") as prediction:
+        vertices = prediction["vertices"]
+    view = training.view_scene(
+        training.scene_of(runtime.stores, scene_id),
+        training.twin_of(runtime.stores, fit.outputs[0].id, None),
+        versions.models.members[(0, 1)].config,
+    )
+    assert view.held is not None and not view.as_recorded and view.held[:, 1].min() == 0
+    again = versions.rollout(view.controllers[view.first :], view.held[view.first :])
+    assert np.abs(again - vertices[view.first :]).max() < 1e-5
+    alone = PublishedModel.from_card(load((tmp_path / "model.safetensors").read_bytes()), card)
+    assert np.abs(alone.rollout(view.controllers[view.first :]) - again).max() > 1e-4
