@@ -38,7 +38,7 @@ from physworld.worldmodel.holding.rollout import HeldModels
 from physworld.worldmodel.holding.spans import train_held
 from physworld.worldmodel.model.graph import build_graph
 
-TAUGHT, JUDGED = 150, 8
+TAUGHT, JUDGED = 300, 8
 TAUGHT_FRAMES, JUDGED_FRAMES = 61, 101
 FPS, GRAVITY = 30.0, np.array([0.0, 0.0, -9.81])
 SETS = ((0, 1), (0,), (1,))
