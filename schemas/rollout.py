@@ -55,6 +55,14 @@ class RolloutCreate(Request):
         description="Tick; where given it must be the model's.",
         json_schema_extra={"unit": "s"},
     )
+    open_s: list[Annotated[list[tuple[float, float]], Field(max_length=1000)]] | None = Field(
+        default=None,
+        max_length=100,
+        description="Of each grip of the scene, times at which it is open, [begin, end] from 0; others hold all "
+        "the time. Needs a version of a recording in which grips let go.",
+        json_schema_extra={"unit": "s"},
+        examples=[[[], [[0.4, 0.7]]]],
+    )
     start: Start = Field(default="recording", description="Begin as the recording did, or at rest.")
     phi: ArrayInput | None = Field(
         default=None,

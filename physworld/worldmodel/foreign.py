@@ -19,8 +19,11 @@ from physworld.scene import Scene
 from physworld.twin.build import PRIOR_FRICTION, build_twin
 from physworld.twin.colliders import twin_colliders
 from physworld.twin.grips import soft_regions, with_touched_nodes
+from physworld.twin.openings import holding
 from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import clock_times, resample, resample_smooth
+from physworld.worldmodel.errors import ControlsInvalid, GraphInvalid
+from physworld.worldmodel.holding.rollout import HeldVersions
 from physworld.worldmodel.model.skinning import affine_skin
 from physworld.worldmodel.published import PublishedModel
 
@@ -107,6 +110,7 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
         ground_height_m=None if recording.ground is None else recording.ground.height_m,
         colliders=twin_colliders(recording, body.half_thickness_m, PRIOR_FRICTION),
         controllers_start=recording.control_track()[1][0],
+        openings=() if own is None else own.openings,
         release_s=0.0 if own is None else own.release_s,
     )
 
@@ -115,7 +119,8 @@ def predict(model: PublishedModel, recording: Scene, twin: Twin) -> ForeignPredi
     """Roll the model out over the recording, from a twin that :func:`twin_on` has put there.
 
     Raises:
-        SceneUnsupported: the recording starts in another shape than the model's, or is too short for its history.
+        SceneUnsupported: the recording starts in another shape than the model's, is too short for its history, or has
+            grips let go in a way that the version has no model for.
     """
     mismatch = start_mismatch(recording, twin)
     size = float(np.ptp(recording.points[0][recording.visible[0]], axis=0).max(initial=0.0))
@@ -139,7 +144,10 @@ def predict(model: PublishedModel, recording: Scene, twin: Twin) -> ForeignPredi
     controllers = resample(control_points, control_times - recording.times[0], times)
     lift = _lift(model, twin)
     start = vertices[first : first + history + 1]
-    rolled = model.rollout(controllers[first:] - lift, history=start - lift) + lift
+    rolled = _rolled(
+        model, twin, controllers[first:] - lift, start - lift, times[first:] + recording.times[0]
+    )
+    rolled += lift
     held = np.repeat(vertices[:1], first, axis=0)
     frame_times = recording.times - recording.times[0]
     tracks = resample_smooth(skin.apply(np.concatenate([held, rolled])), times, frame_times)
@@ -150,6 +158,27 @@ def predict(model: PublishedModel, recording: Scene, twin: Twin) -> ForeignPredi
         first_frame=int(own[0]) if len(own) else len(frame_times),
         start_mismatch_m=mismatch,
     )
+
+
+def _rolled(model: PublishedModel, twin: Twin, controllers: Array, history: Array, moments: Array) -> Array:
+    """Object vertices (T, n, 3) [m], by the models for the grips that hold where some let go.
+
+    Args:
+        model: the version.
+        twin: on the recording.
+        controllers: (T, K, 3) [m].
+        history: object vertices at the first ticks [m], (h+1, n, 3).
+        moments: of the ticks, on the twin's clock [s], (T,).
+
+    Raises:
+        SceneUnsupported: no model of the version is for the grips that hold.
+    """
+    if not twin.openings:
+        return model.rollout(controllers, history=history)
+    try:
+        return HeldVersions.of_one(model).rollout(controllers, holding(twin, moments), history=history)
+    except (ControlsInvalid, GraphInvalid) as error:
+        raise SceneUnsupported(f"grips let go in the recording: {error}") from error
 
 
 def _lift(model: PublishedModel, twin: Twin) -> Array:

@@ -55,7 +55,7 @@ _OWN = ("rest.", "particle.", "control.", "phi", "start.", "skin.", "graph.")
 
 @dataclass(frozen=True)
 class PublishedModel:
-    """See the module's text for the arrays."""
+    """See the module's text for the arrays. ``others``: models for other sets of grips, published with this one."""
 
     model: WorldModel
     phi: Array
@@ -67,6 +67,7 @@ class PublishedModel:
     strengths: Conditioning | None = None
     grips: tuple[tuple[int, ...], ...] = ()
     holding: tuple[int, ...] | None = None
+    others: tuple[PublishedModel, ...] = ()
 
     @property
     def spec(self) -> GraphSpec:

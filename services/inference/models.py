@@ -10,6 +10,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 
 from physworld.worldmodel.errors import VersionUnreadable
+from physworld.worldmodel.holding.rollout import with_others
 from physworld.worldmodel.published import PublishedModel
 from physworld_schemas.fit import Fit
 from physworld_schemas.model import ModelVersion
@@ -75,6 +76,8 @@ class Models:
         try:
             card = json.loads(self._artifacts.read_bytes(files["card.json"]))
             tensors = load_tensors(self._artifacts.read_bytes(files["model.safetensors"]))
+            return with_others(
+                tensors, card, lambda name: load_tensors(self._artifacts.read_bytes(files[name]))
+            )
         except (ValueError, SafetensorError) as error:  # as they were published: their digests are theirs
             raise VersionUnreadable(f"its files are of another format: {error}") from error
-        return PublishedModel.from_card(tensors, card)

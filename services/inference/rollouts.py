@@ -14,6 +14,8 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.worldmodel.controls import on_clock, peak_speed
 from physworld.worldmodel.errors import ControlsInvalid, WorldModelError
+from physworld.worldmodel.holding.rollout import HeldVersions
+from physworld.worldmodel.holding.spans import spans_of
 from physworld.worldmodel.model.properties import DENSITY, STIFFNESS
 from physworld.worldmodel.published import PublishedModel
 from physworld_schemas.arrays import FARTHEST_M, ArrayInput, array_of
@@ -44,6 +46,7 @@ class Prepared:
         phi: log property ratios, (n, 2) or (B, n, 2).
         shown: ticks that are returned.
         times: of those, from the first tick that was asked for [s].
+        holding: which grips hold from each tick to the next, (T, G), where some are open at times; else None.
     """
 
     controllers: Array
@@ -51,6 +54,7 @@ class Prepared:
     phi: Array
     shown: Array
     times: Array
+    holding: Array | None = None
 
     @property
     def steps(self) -> int:
@@ -103,7 +107,10 @@ def prepare(request: RolloutCreate, model: PublishedModel) -> Prepared:
             f"the answer would hold {values} numbers; {MAX_VALUES} are the most: return fewer ticks (every)",
             "every",
         )
-    return Prepared(driven, history, _phi(request, model, len(driven)), shown, (shown - lead) * spec.dt_s)
+    phi, moments = _phi(request, model, len(driven)), (np.arange(ticks) - lead) * spec.dt_s
+    return Prepared(
+        driven, history, phi, shown, (shown - lead) * spec.dt_s, _holding(request, model, moments)
+    )
 
 
 def run(
@@ -128,13 +135,17 @@ def run(
     """
     started = time.perf_counter()
     driven = prepared.controllers
+    versions = None if prepared.holding is None else HeldVersions.of_one(model)
     found: dict[str, list[Array]] = {part: [] for part in request.returns}
     per_candidate = driven.shape[1] - len(prepared.history)
     chunk = max(threads, CHUNK_STEPS // per_candidate)
     for first in range(0, len(driven), chunk):
         taken = slice(first, first + chunk)
         phi = prepared.phi[taken] if prepared.phi.ndim == 3 else prepared.phi
-        vertices = model.rollout_batch(driven[taken], history=prepared.history, phi=phi, threads=threads)
+        if versions is None:
+            vertices = model.rollout_batch(driven[taken], history=prepared.history, phi=phi, threads=threads)
+        else:
+            vertices = _held(versions, prepared, driven[taken], phi)
         _check(vertices, first, prepared.shown[0], model.spec.dt_s)
         vertices = vertices[:, prepared.shown]
         for part in found:
@@ -180,6 +191,48 @@ def _phi(request: RolloutCreate, model: PublishedModel, candidates: int) -> Arra
     factors = {STIFFNESS: request.stiffness_factor, DENSITY: request.density_factor}
     shifts: Array = np.log([factors[column.name] for column in model.columns])
     return phi + shifts
+
+
+def _holding(request: RolloutCreate, model: PublishedModel, moments: Array) -> Array | None:
+    """Which grips hold from each of the ticks (T,) [s] to the next, (T, G); None where all hold all the time."""
+    if request.open_s is None or not any(request.open_s):
+        return None
+    grips = len(model.grips)
+    if len(request.open_s) > grips:
+        raise ControlsInvalid(
+            f"open_s is of {len(request.open_s)} grips; this version knows {grips}", "open_s"
+        )
+    holding = np.ones((len(moments), grips), dtype=np.uint8)
+    for grip, spans in enumerate(request.open_s):
+        for begin, end in spans:
+            if not (0.0 <= begin < end < np.inf):
+                raise ControlsInvalid(
+                    f"grip {grip} is open from {begin:g} to {end:g} s; times are finite and from 0, each begins before "
+                    "it ends",
+                    "open_s",
+                )
+            holding[(moments >= begin - 1e-9) & (moments < end - 1e-9), grip] = 0
+    known = {one.holding for one in model.others} | {tuple(range(grips))}
+    for span in spans_of(holding):
+        if span.grips not in known:
+            raise ControlsInvalid(
+                f"grips {list(span.grips)} hold alone from {moments[span.first]:.3g} s on; this version has models of "
+                f"{', '.join(str(list(one)) for one in sorted(g for g in known if g is not None))}",
+                "open_s",
+            )
+    return holding
+
+
+def _held(versions: HeldVersions, prepared: Prepared, driven: Array, phi: Array) -> Array:
+    """Vertices (B, T, n, 3) [m] of candidates (B, T, K, 3), each by the models for the grips that hold."""
+    every = np.broadcast_to(phi, (len(driven), *phi.shape[-2:]))
+    holding = np.asarray(prepared.holding)
+    return np.stack(
+        [
+            versions.models.rollout(prepared.history, path, holding, own)
+            for path, own in zip(driven, every, strict=True)
+        ]
+    )
 
 
 def _check(vertices: Array, first: int, lead: int, dt_s: float) -> None:

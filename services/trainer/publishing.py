@@ -13,6 +13,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from physworld.worldmodel import export
+from physworld.worldmodel.holding.rollout import with_others
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView
 from physworld_schemas.base import Artifact
@@ -101,8 +102,11 @@ def model_of(stores: Stores, version: ModelVersion) -> PublishedModel:
     """A version as it was published. Raises NotFound, or VersionUnreadable for a layout that is not read here."""
     read = stores.artifacts.read_bytes
     card = json.loads(read(named(version.artifacts, "card.json", version.name).sha256))
-    tensors = load_tensors(read(named(version.artifacts, WEIGHTS_NAME, version.name).sha256))
-    return PublishedModel.from_card(tensors, card)
+
+    def tensors(name: str) -> dict[str, Any]:
+        return load_tensors(read(named(version.artifacts, name, version.name).sha256))
+
+    return with_others(tensors(WEIGHTS_NAME), card, tensors)
 
 
 def store_version(

@@ -42,6 +42,7 @@ class Rollouts(Listed):
         density_factor: float = 1.0,
         returns: Sequence[Part] = ("points",),
         every: int = 1,
+        open_s: Sequence[Sequence[tuple[float, float]]] | None = None,
         as_job: bool = False,
         timeout: float | None = None,
     ) -> Predicted:
@@ -57,6 +58,7 @@ class Rollouts(Listed):
             stiffness_factor, density_factor: on top of them.
             returns: "points" (measured points), "vertices" (the graph's).
             every: return each so many-th tick.
+            open_s: of each grip of the scene, times at which it is open, (begin, end) [s] from 0; by default all hold.
             as_job: queue it, however small.
             timeout: seconds to wait for a job.
         """
@@ -69,6 +71,7 @@ class Rollouts(Listed):
             density_factor=density_factor,
             returns=list(returns),
             every=every,
+            open_s=None if open_s is None else [list(spans) for spans in open_s],
             mode="job" if as_job else "auto",
             times=None if times is None else np.asarray(times, dtype=np.float64).tolist(),
             dt_s=dt_s,

@@ -10,10 +10,11 @@ stay as they are. Grips that close do it on the material where it was predicted
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors.numpy import load_file
@@ -197,7 +198,7 @@ class HeldVersions:
 
     @classmethod
     def published(cls, folder: Path) -> HeldVersions:
-        """The versions that a training of a recording in which grips let go published together.
+        """What a training of a recording in which grips let go published.
 
         Args:
             folder: of a downloaded version: ``card.json``, ``model.safetensors`` and the files of ``card["held"]``.
@@ -206,13 +207,14 @@ class HeldVersions:
             VersionUnreadable: a part of another layout.
         """
         card = json.loads((folder / "card.json").read_text())
-        parts = [{"file": "model.safetensors", "architecture": card["architecture"]}, *card.get("held", [])]
-        return cls.of(
-            [
-                PublishedModel.from_tensors(load_file(folder / part["file"]), part["architecture"])
-                for part in parts
-            ]
+        return cls.of_one(
+            with_others(load_file(folder / "model.safetensors"), card, lambda name: load_file(folder / name))
         )
+
+    @classmethod
+    def of_one(cls, version: PublishedModel) -> HeldVersions:
+        """A version with the others that were published with it. Raises what :meth:`of` does."""
+        return cls.of([version, *version.others])
 
     def rollout(
         self, controllers: Array, holding: Array, *, history: Array | None = None, take_hold: bool = True
@@ -227,6 +229,23 @@ class HeldVersions:
         """
         start = self.start_history if history is None else history
         return self.models.rollout(start, controllers, holding, self.phi, take_hold=take_hold)
+
+
+def with_others(
+    tensors: dict[str, Array], card: dict[str, Any], read: Callable[[str], dict[str, Array]]
+) -> PublishedModel:
+    """A version with the models for other sets of grips that its card names (``held``).
+
+    Args:
+        tensors: of ``model.safetensors``.
+        card: of ``card.json``.
+        read: gives the tensors of another file of the version by its name.
+
+    Raises:
+        VersionUnreadable: a part of another layout.
+    """
+    others = (PublishedModel.from_tensors(read(p["file"]), p["architecture"]) for p in card.get("held", []))
+    return replace(PublishedModel.from_card(tensors, card), others=tuple(others))
 
 
 def _unknown(span: Span, members: Mapping[Grips, WorldModel]) -> str:

@@ -23,6 +23,7 @@ from physworld_schemas.plan import PlanConfig, PlanLimits
 from physworld_schemas.rollout import Part
 from physworld_schemas.wording import reason
 
+MOST_GRIPS = 100
 Version = Annotated[str, typer.Option(help="Number, alias or latest.")]
 
 
@@ -42,6 +43,12 @@ def rollout(
     vertices: Annotated[bool, typer.Option(help="Also the vertices of the graph.")] = False,
     every: Annotated[int, typer.Option(min=1, help="Return each so many-th tick.")] = 1,
     stiffness: Annotated[float, typer.Option(help="Factor on the stiffness.")] = 1.0,
+    opened: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--open", metavar="GRIP:BEGIN,END", help="A grip, from 0, is open from BEGIN to END [s]."
+        ),
+    ] = None,
     timeout: Annotated[float | None, typer.Option(min=0, help="Seconds to wait for a job.")] = None,
     json: Json = False,
 ) -> None:
@@ -58,6 +65,7 @@ def rollout(
         stiffness_factor=stiffness,
         returns=returns,
         every=every,
+        open_s=open_times(opened or []),
         timeout=timeout,
     )
     parts = {"points": found.points, "vertices": found.vertices}
@@ -72,6 +80,22 @@ def rollout(
         markup=False,
         soft_wrap=True,
     )
+
+
+def open_times(spans: list[str]) -> list[list[tuple[float, float]]] | None:
+    """Times at which each grip is open [s] from texts GRIP:BEGIN,END. Raises BadParameter."""
+    found: dict[int, list[tuple[float, float]]] = {}
+    for text in spans:
+        try:
+            grip, _, times = text.partition(":")
+            begin, end = (float(part) for part in times.split(","))
+            number = int(grip)
+        except ValueError as error:
+            raise typer.BadParameter(f"{text!r} is not GRIP:BEGIN,END", param_hint="--open") from error
+        if not 0 <= number < MOST_GRIPS:
+            raise typer.BadParameter(f"{text!r} is of grip {number}; they count from 0", param_hint="--open")
+        found.setdefault(number, []).append((begin, end))
+    return [found.get(grip, []) for grip in range(max(found) + 1)] if found else None
 
 
 def plan(

@@ -16,10 +16,15 @@ from tiny_scene import LENGTH_M, SIDE_M, register, tiny_scene
 
 from physworld.scene import Grip, Scene
 from physworld.worldmodel import PublishedModel
+from physworld.worldmodel.errors import ControlsInvalid
 from physworld.worldmodel.holding.rollout import HeldVersions
+from physworld_schemas.arrays import EncodedArray
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.model import ModelVersion, TrainingConfig, TrainingCreate
+from physworld_schemas.rollout import RolloutCreate
+from physworld_services.inference import rollouts
+from physworld_services.inference.models import Models
 from physworld_services.trainer import training
 from physworld_storage import registry
 from physworld_storage.database import open_database
@@ -229,5 +234,22 @@ def test_a_recording_in_which_a_grip_lets_go_gives_one_version_that_follows_it(
     assert view.held is not None and not view.as_recorded and view.held[:, 1].min() == 0
     again = versions.rollout(view.controllers[view.first :], view.held[view.first :])
     assert np.abs(again - vertices[view.first :]).max() < 1e-5
+    model = Models(runtime.database, runtime.stores.artifacts).get("caught", 1)[1]
+    asked = RolloutCreate(
+        model="caught",
+        controllers=EncodedArray.of(view.controllers[view.first :]),
+        open_s=[[], [(OPENED / fps, CLOSED / fps)]],
+        returns=["vertices"],
+    )
+    over_http, _ = rollouts.run(asked, model, rollouts.prepare(asked, model))
+    assert np.abs(over_http["vertices"][0] - again).max() < 1e-5
+    for wrong, says in (
+        ([[]] * 3 + [[(0.1, 0.2)]], "4 grips; this version knows 2"),
+        ([[], [(0.2, 0.1)]], "open from 0.2 to 0.1 s"),
+        ([[(0.2, 0.3)], []], r"grips \[1\] hold alone from 0.2 s on"),
+    ):
+        with pytest.raises(ControlsInvalid, match=says):
+            rollouts.prepare(asked.model_copy(update={"open_s": wrong}), model)
+
     alone = PublishedModel.from_card(load((tmp_path / "model.safetensors").read_bytes()), card)
     assert np.abs(alone.rollout(view.controllers[view.first :]) - again).max() > 1e-4
