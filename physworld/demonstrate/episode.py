@@ -32,6 +32,7 @@ from physworld.demonstrate.regrasp import (
     closing_times,
     drawn_regrasp,
     led_on,
+    takes_elsewhere,
 )
 from physworld.demonstrate.replay import (
     VARIANTS,
@@ -134,6 +135,7 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
     dt = model_dt(scene.fps)
     duration = (episode_frames(scene, config) - 1) * dt
     replays = choice.uniform() < config.replay_share
+    replays &= not takes_elsewhere(twin)
     if replays and training_track(scene)[0][-1] >= dt:  # shorter training frames hold no tick to replay
         motion, rate = str(choice.choice(VARIANTS)), float(np.exp(choice.uniform(*np.log(WARP))))
         motion = "replay" if twin.openings else motion  # its grips open when they did
@@ -209,10 +211,9 @@ def run_episode(twin: Twin, plan: EpisodePlan, progress: Progress | None = None)
     if not plan.opens:
         return episode_arrays(plan, own.particles_at(moved))
     held = holding(own, plan.times)
-    if not any(plan.openings):
-        held[:, [not len(nodes) for nodes in own.held_nodes]] = (
-            0  # open at the start, and all through this motion
-        )
+    for grip, gripped in enumerate(own.held_nodes):  # open at the start, and all through this motion
+        if not len(gripped) and (not plan.openings or plan.openings[grip] is None):
+            held[:, grip] = 0
     plan = replace(plan, controllers=along_with_the_material(own, plan.controllers, moved, held))
     return {**episode_arrays(plan, own.particles_at(moved)), "holding": held}
 
@@ -249,7 +250,9 @@ def make_episode(
         plan = None
         try:
             plan = plan_episode(scene, twin, config, tried)
-            return run_episode(twin, plan, progress), accepted_attributes(plan, rejected)
+            arrays = run_episode(twin, plan, progress)
+            moved = replace(plan, controllers=arrays["controllers"].astype(float)) if plan.opens else plan
+            return arrays, accepted_attributes(moved, rejected)
         except SimulationError as error:
             rejected.append(rejection(tried, plan, error))
     raise all_rejected(seed, rejected)

@@ -57,6 +57,14 @@ def able(twin: Twin) -> tuple[int, ...]:
     return holding if len(holding) > 1 and not twin.form.on_particles else ()
 
 
+def takes_elsewhere(twin: Twin) -> bool:
+    """Whether a grip of the recording may take hold of other material than at its start, which is not replayed."""
+    return any(
+        one is not None and (one.radius_m is not None or not len(nodes))
+        for one, nodes in zip(twin.openings, twin.held_nodes, strict=False)
+    )
+
+
 def drawn_regrasp(twin: Twin, times: Array, generator: np.random.Generator) -> Regrasp | None:
     """One of the grips, and when it opens and closes, at ticks (T,) [s]; None where no grip may, or time is short."""
     grips, last = able(twin), len(times) - 1

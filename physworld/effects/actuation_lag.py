@@ -38,7 +38,9 @@ class ActuationLag(Effect):
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:
-        """A body that nobody holds follows no controller."""
+        """A body that nobody holds follows no controller; when a late hand lets go is not known."""
+        if twin.openings:
+            return f"{sum(one is not None for one in twin.openings)} of the grips let go"
         held = sum(len(nodes) for nodes in twin.held_nodes)
         return f"{held} nodes are held: no grip that could lag" if held == 0 else None
 

@@ -296,6 +296,7 @@ def free_swing(
         effects=(),
         plasticity=None,
         release_s=0.0,
+        openings=(),
     )
     control_times, controls = scene.control_track()
     still = np.repeat(controls[:1], len(control_times), axis=0)

@@ -277,9 +277,9 @@ def library_of(scene: Scene, twin: Twin, draws: int, longest_s: float, seed: int
 
 
 def from_rest(twin: Twin) -> Twin:
-    """The twin as an experiment finds it: where the first frame saw it, at rest, and free from the start."""
+    """The twin as an experiment finds it: where the first frame saw it, at rest, free to move, and held on to."""
     body = replace(twin.body, start_velocity=np.zeros_like(twin.body.start_velocity))
-    return replace(twin, body=body, release_s=0.0)
+    return replace(twin, body=body, release_s=0.0, openings=())
 
 
 def clock_of(scene: Scene, longest_s: float) -> tuple[Array, Array]:

@@ -129,5 +129,6 @@ class PlanningTask:
         times = self.dt_s * np.arange(past + len(path))
         control_times, control_points = self.scene.control_track()
         recorded = resample(control_points, control_times - self.scene.times[0], times[:past])
-        nodes = self.twin.simulate_nodes(times, np.concatenate([recorded, path]), times)
+        twin = replace(self.twin, openings=())  # the hands hold on, as the model has it
+        nodes = twin.simulate_nodes(times, np.concatenate([recorded, path]), times)
         return self.twin.track_nodes(nodes)[past:]

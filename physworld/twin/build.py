@@ -103,7 +103,7 @@ def build_twin(
         taken = np.concatenate([taken, nodes])
     if is_hung_sheet(scene, mesh):
         groups, held = (np.arange(2),), [upper_edge(body.lattice)]
-    openings = tuple(opening_of(grip, float(scene.times[0])) for grip in grips)
+    openings = tuple(opening_of(grip, scene.times) for grip in grips)
     openings = openings if any(one is not None for one in openings) else ()
     if openings and choice.formulation.on_particles:
         raise SceneUnsupported(

@@ -24,6 +24,8 @@ from physworld.twin.grips import gripped_nodes
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
 
+_MERGE_S = 1e-6  # times closer than this are one, as for the solver's knots
+
 
 @dataclass(frozen=True)
 class Opening:
@@ -38,18 +40,18 @@ class Opening:
     radius_m: float | None = None
 
     def closed(self, times: Array) -> Array:
-        """Whether it is closed at times (T,) [s], (T,) bool; at the beginning of a time that it is open it is open."""
-        is_open = np.zeros(len(times), dtype=bool)
+        """Whether it is closed all the way from each of the times (T,) [s] to the next, (T-1,) bool."""
+        is_open = np.zeros(len(times) - 1, dtype=bool)
         for begin, end in self.open_s:
-            is_open |= (times >= begin) & (times < end)
+            is_open |= (times[1:] > begin + _MERGE_S) & (times[:-1] < end - _MERGE_S)
         return ~is_open
 
 
-def opening_of(grip: Grip, first_s: float) -> Opening | None:
-    """When a declared grip is open, on the clock of a recording that begins at ``first_s`` [s]; None: never."""
-    if not grip.open_s:
-        return None
-    return Opening(tuple((first_s + begin, first_s + end) for begin, end in grip.open_s), grip.radius_m)
+def opening_of(grip: Grip, times: Array) -> Opening | None:
+    """When a declared grip is open, on the clock of a recording with frames at ``times`` (T,) [s]; None: never."""
+    first, last = float(times[0]), float(times[-1])
+    spans = tuple((first + begin, first + end) for begin, end in grip.open_s if first + begin < last)
+    return Opening(spans, grip.radius_m) if spans else None
 
 
 def switch_times(openings: Sequence[Opening | None]) -> Array:
@@ -59,13 +61,14 @@ def switch_times(openings: Sequence[Opening | None]) -> Array:
 
 
 def holding(twin: Twin, times: Array) -> Array:
-    """Whether each grip holds from each of the times (T,) [s] to the next, (T, G) uint8; the last row is repeated."""
+    """Whether each grip holds all the way from each of the times (T,) [s] to the next, (T, G) uint8; the last row is
+    that before it.
+    """
     found = np.ones((len(times), len(twin.controller_groups)), dtype=np.uint8)
     for number, one in enumerate(twin.openings):
-        if one is not None:
-            found[:, number] = one.closed(times)
-    if len(found) > 1:
-        found[-1] = found[-2]
+        if one is not None and len(times) > 1:
+            closed = one.closed(times)
+            found[:, number] = np.append(closed, closed[-1])
     return found
 
 
@@ -87,7 +90,7 @@ def _hands_of(twin: Twin, times: Array, controls: Array) -> tuple[Hand, ...]:
     for number, one in enumerate(twin.openings):
         if one is None:
             continue
-        group, closed = twin.controller_groups[number], one.closed(0.5 * (times[:-1] + times[1:]))
+        group, closed = twin.controller_groups[number], one.closed(times)
         if closed.all():
             continue
         rotations, shifts = rigid_motion(twin.controllers_start[group], controls[:, group])

@@ -62,7 +62,8 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
         particle_budget: of a body built from the recording; that of the home fit lets lattices agree.
 
     Raises:
-        SceneUnsupported: the recording has other controllers, or, where the twin has to be moved, other points.
+        SceneUnsupported: the recording has other controllers, or, where the twin has to be moved, other points or grips
+            that let go.
     """
     counts = [(scene.controllers.shape[1], scene.points.shape[1]) for scene in (home, recording)]
     if counts[0][0] != counts[1][0]:
@@ -96,6 +97,10 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
     starts = [np.concatenate([scene.points[0], scene.control_track()[1][0]]) for scene in (home, recording)]
     seen = np.concatenate([home.visible[0] & recording.visible[0], np.ones(counts[0][0], dtype=bool)])
     turns, shifts = rigid_motion(starts[0][seen], starts[1][seen][None])
+    if twin.openings or any(grip.open_s for grip in recording.grips):
+        raise SceneUnsupported(
+            "grips let go, of a body that looks different in the recording: it is not known what they hold there"
+        )
     body = twin.body
     if soft_regions(twin):  # their boxes stand where the body was
         twin = with_touched_nodes(twin, body.start)
@@ -110,7 +115,6 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
         ground_height_m=None if recording.ground is None else recording.ground.height_m,
         colliders=twin_colliders(recording, body.half_thickness_m, PRIOR_FRICTION),
         controllers_start=recording.control_track()[1][0],
-        openings=() if own is None else own.openings,
         release_s=0.0 if own is None else own.release_s,
     )
 

@@ -21,6 +21,7 @@ from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import clock_times, model_dt, resample, resample_smooth
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.finetune import Recording
+from physworld.worldmodel.holding.spans import sets_of
 from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.graph import GraphSpec, build_graph
@@ -69,8 +70,11 @@ class SceneView:
 
     @property
     def as_recorded(self) -> bool:
-        """Whether the graph's grips hold all through the recording, so that it shows what the model should do."""
-        return self.holding is None and self.held is None
+        """Whether the graph's grips, and no others, hold all through the recording, so that it shows their motion."""
+        if self.held is None:
+            return self.holding is None
+        own = tuple(range(len(self.grips))) if self.holding is None else self.holding
+        return sets_of(self.held) == [own]
 
     @property
     def start_history(self) -> Array:

@@ -212,12 +212,12 @@ def _holding(request: RolloutCreate, model: PublishedModel, moments: Array) -> A
                     "open_s",
                 )
             holding[(moments >= begin - 1e-9) & (moments < end - 1e-9), grip] = 0
-    known = {one.holding for one in model.others} | {tuple(range(grips))}
+    known = {tuple(range(grips)) if one.holding is None else one.holding for one in (model, *model.others)}
     for span in spans_of(holding):
         if span.grips not in known:
             raise ControlsInvalid(
-                f"grips {list(span.grips)} hold alone from {moments[span.first]:.3g} s on; this version has models of "
-                f"{', '.join(str(list(one)) for one in sorted(g for g in known if g is not None))}",
+                f"from {moments[span.first]:.3g} s on only grips {list(span.grips)} hold; this version has models of "
+                f"{', '.join(str(list(one)) for one in sorted(known))}",
                 "open_s",
             )
     return holding

@@ -16,6 +16,7 @@ from physworld.evaluate.metrics import metrics
 from physworld.evaluate.table import held_out_table
 from physworld.worldmodel.clock import resample_smooth
 from physworld.worldmodel.energy import still_energy
+from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.holding.rollout import HeldVersions
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView
@@ -69,7 +70,10 @@ def measure(
     poll(SPEED_REPEATS, RUNS)
     calibrated = (before or published).rollout(controllers, phi=published.phi_calibrated)
     if held is not None and view.held is not None:
-        rolled = calibrated = held.rollout(controllers, view.held[view.first :])
+        try:
+            rolled = calibrated = held.rollout(controllers, view.held[view.first :])
+        except GraphInvalid:  # one of them left the numbers before another one takes over
+            rolled = calibrated = np.full_like(rolled, np.nan)
     frame_times = view.scene.times - view.scene.times[0]
     tracks, tracks_calibrated = view.tracks_of(rolled), view.tracks_of(calibrated)
     twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)

@@ -45,6 +45,7 @@ from physworld.worldmodel.holding.spans import Grips, every_grip, look_ahead_for
 from physworld.worldmodel.model import config as settings_of
 from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, first_episodes, train
 from physworld_schemas.base import Reference
@@ -132,10 +133,15 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     )
     untuned = trained.model.at_strengths(dict.fromkeys(tuned.strengths, 0.0))
     before = view.published(untuned, phi, phi)
-    members = []
+    members: list[PublishedModel] = []
     for grips in others:
         seen, parts = seen_by(grips)
-        own = _train(context, stores, parts, seen, architecture, training, network, grips).model
+        try:
+            own = _train(context, stores, parts, seen, architecture, training, network, grips).model
+        except DatasetUnusable as absent:  # no demonstration shows these grips alone
+            logger.warning("job %s: %s", context.lease.job_id, absent)
+            members = []
+            break
         members.append(seen.published(own.at_strengths(dict.fromkeys(tuned.strengths, 0.0)), phi, phi))
     held = HeldVersions.of([published, *members]) if members else None
     context.begin(MEASURING)

@@ -66,6 +66,8 @@ def _measured(
 ) -> dict[str, Any]:
     if not fitted.twin.lattice.smooth:
         return not_measured(f"{fitted.twin.lattice.title} has no finer cells to be asked")
+    if fitted.twin.openings:
+        return not_measured("grips let go in the recording: what work they do is not kept")
     none = _not_extrapolated(fitted)
     total = MEASURED_RUNS + (0 if none else len(fitted.searched))
 

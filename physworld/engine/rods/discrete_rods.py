@@ -215,7 +215,8 @@ class Launch:
             self._array(np.stack([_driven(p, len(self.times)) for p in rods.problems]), wp.vec3d),
         ]
         start = np.where((numbers >= 0)[:, None], 0.0, v)
-        start[held[0].nodes] = held[0].velocities[0]
+        now = numbers[held[0].nodes] >= 0
+        start[held[0].nodes[now]] = held[0].velocities[0, now]
 
         def copied(values: Array, dtype: type) -> wp.array:
             return self._array(np.broadcast_to(values, (copies, *values.shape)), dtype)

@@ -20,7 +20,7 @@ import numpy as np
 from safetensors.numpy import load_file
 
 from physworld.arrays import Array
-from physworld.worldmodel.errors import ControlsInvalid, GraphInvalid
+from physworld.worldmodel.errors import ControlsInvalid, GraphInvalid, VersionUnreadable
 from physworld.worldmodel.holding.spans import Grips, Span, every_grip, spans_of
 from physworld.worldmodel.holding.taking import taken_hold, vertices_near
 from physworld.worldmodel.model.model import WorldModel
@@ -91,7 +91,8 @@ class HeldModels:
             holding: (T, G): 1 where a grip holds from that frame to the next one.
             phi: log property ratios (n, 2), for all members or one for each.
             take_hold: whether a grip that closes holds the material where it was predicted; otherwise it is as if it
-                were where the hand's path expects it.
+                were where the hand's path expects it. One that is open at frame 0 held nothing before: it is where its
+                hand is.
 
         Raises:
             ControlsInvalid: ``holding`` of another shape, or grips hold that no member is for.
@@ -103,6 +104,7 @@ class HeldModels:
         window, driven = len(history), hand.copy()
         path = np.empty((len(hand), *history.shape[1:]))
         path[:window] = history
+        never = {g for g in range(len(self.groups)) if spans and g not in spans[0].grips}
         opened: dict[int, int] = {}
         for span in spans:
             if not np.isfinite(path[: max(span.first + 1, window)]).all():
@@ -111,7 +113,7 @@ class HeldModels:
                     f"{list(span.grips)} hold"
                 )
             if take_hold:
-                for grip in sorted(opened.keys() & set(span.grips)):
+                for grip in sorted((opened.keys() & set(span.grips)) - never):
                     self._close(grip, opened[grip], path[: span.first + 1], hand, driven)
             opened = {g: opened.get(g, span.first) for g in range(len(self.groups)) if g not in span.grips}
             known = max(span.first + 1, window)
@@ -244,8 +246,18 @@ def with_others(
     Raises:
         VersionUnreadable: a part of another layout.
     """
-    others = (PublishedModel.from_tensors(read(p["file"]), p["architecture"]) for p in card.get("held", []))
-    return replace(PublishedModel.from_card(tensors, card), others=tuple(others))
+    version = PublishedModel.from_card(tensors, card)
+    others = []
+    for number, part in enumerate(card.get("held", [])):
+        if part.get("file") != f"held_{number}.safetensors" or "architecture" not in part:
+            raise VersionUnreadable(
+                f"its card names {part.get('file')!r} as the model of other grips {number}"
+            )
+        try:
+            others.append(PublishedModel.from_tensors(read(part["file"]), part["architecture"]))
+        except (KeyError, FileNotFoundError) as error:
+            raise VersionUnreadable(f"it lacks {part['file']}") from error
+    return replace(version, others=tuple(others))
 
 
 def _unknown(span: Span, members: Mapping[Grips, WorldModel]) -> str:

@@ -246,7 +246,7 @@ def test_a_recording_in_which_a_grip_lets_go_gives_one_version_that_follows_it(
     for wrong, says in (
         ([[]] * 3 + [[(0.1, 0.2)]], "4 grips; this version knows 2"),
         ([[], [(0.2, 0.1)]], "open from 0.2 to 0.1 s"),
-        ([[(0.2, 0.3)], []], r"grips \[1\] hold alone from 0.2 s on"),
+        ([[(0.2, 0.3)], []], r"from 0.2 s on only grips \[1\] hold"),
     ):
         with pytest.raises(ControlsInvalid, match=says):
             rollouts.prepare(asked.model_copy(update={"open_s": wrong}), model)
