@@ -13,7 +13,7 @@ from physworld.demonstrate.regrasp import SHORTEST_TICKS, able
 from physworld.demonstrate.side_by_side import make_episodes
 from physworld.errors import BatchRefused
 from physworld.geometry.rigid import rigid_motion
-from physworld.scene import Scene
+from physworld.scene import Grip, Scene
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
@@ -88,3 +88,26 @@ def test_one_hand_alone_never_lets_go_and_several_at_once_are_not_simulated_side
         make_episodes(scene, twin, EVERY, [0, 1])
     with pytest.raises(ValueError, match=r"regrasp share 1\.5"):
         DemonstrationConfig(regrasp_share=1.5)
+
+
+def test_a_hand_that_is_open_at_the_start_holds_nothing_in_any_demonstration(known) -> None:  # type: ignore[no-untyped-def]
+    scene, _ = known
+    third = Grip((8, 9, 10, 11), open_s=((0.0, 0.3),))
+    hand = scene.controllers[:, :4] + np.array([0.1, 0.0, 0.1])
+    scene = replace(
+        scene, controllers=np.concatenate([scene.controllers, hand], axis=1), grips=(*scene.grips, third)
+    )
+    twin = build_twin(scene, 100).with_parameters(**BAR)
+    assert [len(nodes) > 0 for nodes in twin.held_nodes] == [True, True, False] and able(twin) == (0, 1)
+    for config in (EVERY, replace(EVERY, regrasp_share=0.0), replace(EVERY, replay_share=1.0)):
+        plan = plan_episode(scene, twin, config, 0)
+        assert not plan.motion.startswith("replay")
+        holding = make_episode(scene, twin, config, 0)[0]["holding"]
+        assert not holding[:, 2].any() and holding[:, :2].any(axis=1).all()
+
+
+def test_what_is_recorded_of_an_episode_is_of_the_hands_path_as_it_was(known) -> None:  # type: ignore[no-untyped-def]
+    arrays, attributes = make_episode(*known, EVERY, 3)
+    reach = np.abs(arrays["controllers"] - arrays["controllers"][0]).max()
+    assert attributes["control_reach_m"] == pytest.approx(reach, rel=1e-5)
+    assert attributes["regrasp"]["open_s"] < attributes["regrasp"]["close_s"]

@@ -162,3 +162,31 @@ def test_what_cannot_follow_a_hand_that_opens_says_so() -> None:
 def test_a_twin_whose_grips_always_hold_is_what_it_was() -> None:
     assert build_twin(tiny_scene(), 60).openings == ()
     assert "openings" not in str(build_twin(tiny_scene(), 60).to_arrays()["facts"])
+
+
+def test_a_rope_whose_grip_has_a_reach_starts_as_fast_as_any_other() -> None:
+    points = np.stack([0.06 * np.arange(11), 0.01 * np.sin(np.arange(11)), np.full(11, 0.5)], axis=1)
+    body = Body(segment_rest_lengths_m=np.full(10, 0.06), radius_m=0.005)
+    risen = []
+    for reach in (None, 0.04):
+        grips = (Grip((0,)), Grip((1,), open_s=((OPEN, SHUT),), radius_m=reach))
+        scene = made_scene(points, "rope", points[[0, -1]], len(TIMES), grips=grips, body=body, times=TIMES)
+        twin = build_twin(scene, 60)
+        speed = np.zeros_like(twin.body.start)
+        speed[5] = [0.0, 0.0, 1.0]
+        nodes = run(replace(twin, body=replace(twin.body, start_velocity=speed)))
+        risen.append(nodes[1, 5, 2] - nodes[0, 5, 2])
+    assert risen[0] > 1e-3 and abs(risen[1] - risen[0]) < 0.1 * risen[0]
+
+
+def test_a_tick_in_which_a_grip_is_open_for_a_part_is_none_that_it_holds() -> None:
+    ticks = np.arange(120) / 30.0
+    assert np.flatnonzero(~Opening(((3.7, 3.8),)).closed(ticks)).tolist() == [111, 112, 113]
+    assert np.flatnonzero(~Opening(((0.21, 0.22),)).closed(ticks)).tolist() == [6]
+    assert np.flatnonzero(~Opening(((0.0, np.inf),)).closed(ticks)).tolist() == list(range(119))
+
+
+def test_a_grip_that_lets_go_after_the_last_frame_never_does() -> None:
+    scene = bar()
+    late = replace(scene, grips=(scene.grips[0], opened(scene.grips[1], (50.0, 60.0))))
+    assert build_twin(late, 100).openings == ()

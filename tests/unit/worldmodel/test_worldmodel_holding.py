@@ -289,3 +289,18 @@ def test_published_versions_roll_out_together(models: HeldModels) -> None:
     before = {name: fact for name, fact in versions[0].facts().items() if name not in {"grips", "holding"}}
     old = PublishedModel.from_tensors(versions[0].to_tensors(), before)
     assert (old.holding, old.grips) == (None, ())
+
+
+def test_a_grip_that_is_open_at_the_start_closes_where_its_hand_is(models: HeldModels) -> None:
+    """It stood to no material before: its path is taken as it is, whether material is to be taken hold of or not."""
+    arrays = every()[-1]
+    history, hands = true_path(arrays)[: H + 1], arrays["controllers"].astype(float)
+    holding = arrays["holding"].copy()
+    closes = int(np.flatnonzero(holding[:, 1] == 0)[-1]) + 1
+    holding[:closes, 1] = 0
+    taken, given = (models.rollout(history, hands, holding, PHI, take_hold=one) for one in (True, False))
+    assert np.abs(taken - given).max() == 0.0
+    usual, path = (
+        models.rollout(history, hands, arrays["holding"], PHI, take_hold=one) for one in (True, False)
+    )
+    assert np.abs(usual - path).max() > 1e-5
