@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from tiny_scene import tiny_scene
+from two_handed_bar import opened, two_handed_bar
 
 from benchmarks.peers.flex_sheet import FlexSheet, record
 from physworld.effects.registry import effect
@@ -134,6 +135,31 @@ def test_other_controllers_or_points_are_refused_with_their_numbers() -> None:
     fewer = replace(fewer, points=fewer.points[:, :3], visible=fewer.visible[:, :3])
     with pytest.raises(SceneUnsupported, match="shows 3 points"):
         twin_on(fewer, home, twin, 60)
+
+
+def test_where_grips_let_go_a_version_needs_models_for_those_that_hold() -> None:
+    home = two_handed_bar()
+    twin = build_twin(home, 60)
+    config = WorldModelConfig(hidden=16, message_passing_steps=1, vertices=20)
+    both, left = (view_scene(home, twin, config, grips) for grips in (None, (0,)))
+    phi = np.zeros((both.spec.object_count, 2))
+    model, other = (view.published(WorldModel(config, view.spec), phi, phi) for view in (both, left))
+    caught = replace(home, grips=(home.grips[0], opened(home.grips[1], (0.2, 0.3))))
+    placed = twin_on(caught, home, twin, 60)
+    assert placed.openings[1] is not None
+    with pytest.raises(SceneUnsupported, match=r"grips let go .* \[0\] hold .* world models of \[0, 1\]"):
+        predict(model, caught, placed)
+    alone, together = (
+        predict(one, scene, on).tracks
+        for one, scene, on in (
+            (model, home, twin),
+            (replace(model, others=(other,)), caught, placed),
+        )
+    )
+    assert np.isfinite(together).all() and together.shape == alone.shape
+    elsewhere = replace(moved(home), controllers=home.controllers)
+    with pytest.raises(SceneUnsupported, match="looks different"):
+        twin_on(replace(elsewhere, grips=caught.grips), home, twin, 60)
 
 
 def test_ticks_count_from_the_first_frame_not_from_the_first_control_sample() -> None:
