@@ -220,7 +220,7 @@ def _check_open(grip: GripForm, measured: Measured, where: list[str | int], find
         if not (before <= begin < end):
             findings.fault(
                 where,
-                f"holds {begin:g} to {end:g} s after {before:g} s; times begin, end and follow each other",
+                f"has {begin:g} to {end:g} s after {before:g} s; each begins before it ends, one after another",
             )
             return
         if begin > last:
