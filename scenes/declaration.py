@@ -103,7 +103,7 @@ class GripForm(Form):
     region_max_m: Vector | None = None
     points: list[Index] = Field(default_factory=list)
     radius_m: Positive | None = None
-    open_s: list[tuple[Number, Number]] = Field(default_factory=list)
+    open_s: list[tuple[Number, Number]] = Field(default_factory=list, max_length=1000)
 
 
 class ColliderForm(Form):

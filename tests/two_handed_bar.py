@@ -19,20 +19,19 @@ def hand(x: float) -> np.ndarray:
     return np.array([[x, y, z] for y in (-0.02, 0.02) for z in (-0.02, 0.02)])
 
 
-def two_handed_bar(first: Grip | None = None, second: Grip | None = None, **facts: object) -> Scene:
+def two_handed_bar() -> Scene:
     """A bar along x between two hands."""
     places = np.stack(np.meshgrid(np.linspace(0, LONG, 9), (-0.02, 0.02), (-0.02, 0.02), indexing="ij"), -1)
     low, high = np.array([0.0, -0.02, -0.02]), np.array([LONG, 0.02, 0.02])
     reach = np.array([0.03, 0.05, 0.05])
     grips = (
-        first or Grip((0, 1, 2, 3), low - 0.01, low + reach),
-        second or Grip((4, 5, 6, 7), high - reach, high + 0.01),
+        Grip((0, 1, 2, 3), low - 0.01, low + reach),
+        Grip((4, 5, 6, 7), high - reach, high + 0.01),
     )
-    scene = made_scene(
+    return made_scene(
         places.reshape(-1, 3), "beam", np.concatenate([hand(0.0), hand(LONG)]), len(TIMES),
         body=box_body(low, high, density_kg_m3=1000.0), grips=grips, times=TIMES, initial_state="undeformed",
     )  # fmt: skip
-    return replace(scene, **facts)  # type: ignore[arg-type]
 
 
 def opened(grip: Grip, *spans: tuple[float, float], radius_m: float | None = None) -> Grip:

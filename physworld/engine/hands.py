@@ -66,7 +66,9 @@ class Openings:
             room = np.zeros((len(times), len(more), 3))
             nodes = np.concatenate([nodes, more])
             positions, velocities = (np.concatenate([path, room], axis=1) for path in (positions, velocities))
-        self.nodes, self.positions, self.velocities = nodes, positions.copy(), velocities.copy()
+        if held.hands:  # the paths are written while the run goes on
+            positions, velocities = positions.copy(), velocities.copy()
+        self.nodes, self.positions, self.velocities = nodes, positions, velocities
         self._times, self._hands = np.asarray(times, dtype=float), held.hands
         self._rows = np.full(count, -1, dtype=np.int32)
         self._rows[nodes] = np.arange(len(nodes), dtype=np.int32)

@@ -37,7 +37,9 @@ def gripped(twin: Twin, grip: int) -> np.ndarray:
     return np.flatnonzero(x < 0.02 if grip == 0 else x > 0.18)
 
 
-def test_the_hand_is_where_its_material_is_whenever_it_holds_it(known: tuple[Scene, Twin], episode) -> None:  # type: ignore[no-untyped-def]
+def test_the_hand_is_where_its_material_is_whenever_it_holds_it(
+    known: tuple[Scene, Twin], episode: dict[str, np.ndarray]
+) -> None:
     _, twin = known
     holding = episode["holding"].astype(bool)
     grip = int(np.argmin(holding.all(axis=0)))
@@ -52,7 +54,9 @@ def test_the_hand_is_where_its_material_is_whenever_it_holds_it(known: tuple[Sce
     assert strayed > 0.02
 
 
-def test_controllers_are_continuous_and_the_hand_gives_up_the_speed_of_the_material(known, episode) -> None:  # type: ignore[no-untyped-def]
+def test_controllers_are_continuous_and_the_hand_gives_up_the_speed_of_the_material(
+    episode: dict[str, np.ndarray],
+) -> None:
     steps = np.linalg.norm(np.diff(episode["controllers"], axis=0), axis=2).max(axis=1)
     usual = np.linalg.norm(np.diff(episode["particles"], axis=0), axis=2).max()
     assert steps.max() < 1.2 * usual
@@ -79,7 +83,9 @@ def test_a_recording_whose_grip_lets_go_is_replayed_with_it(known: tuple[Scene, 
     assert 0.05 < 1.0 - arrays["holding"][:, 1].mean() < 0.5
 
 
-def test_one_hand_alone_never_lets_go_and_several_at_once_are_not_simulated_side_by_side(known) -> None:  # type: ignore[no-untyped-def]
+def test_one_hand_alone_never_lets_go_and_several_at_once_are_not_simulated_side_by_side(
+    known: tuple[Scene, Twin],
+) -> None:
     scene, twin = known
     alone = build_twin(replace(scene, grips=scene.grips[:1]), 100)
     assert able(alone) == () and able(twin) == (0, 1)
@@ -90,7 +96,9 @@ def test_one_hand_alone_never_lets_go_and_several_at_once_are_not_simulated_side
         DemonstrationConfig(regrasp_share=1.5)
 
 
-def test_a_hand_that_is_open_at_the_start_holds_nothing_in_any_demonstration(known) -> None:  # type: ignore[no-untyped-def]
+def test_a_hand_that_is_open_at_the_start_holds_nothing_in_any_demonstration(
+    known: tuple[Scene, Twin],
+) -> None:
     scene, _ = known
     third = Grip((8, 9, 10, 11), open_s=((0.0, 0.3),))
     hand = scene.controllers[:, :4] + np.array([0.1, 0.0, 0.1])
@@ -106,7 +114,7 @@ def test_a_hand_that_is_open_at_the_start_holds_nothing_in_any_demonstration(kno
         assert not holding[:, 2].any() and holding[:, :2].any(axis=1).all()
 
 
-def test_what_is_recorded_of_an_episode_is_of_the_hands_path_as_it_was(known) -> None:  # type: ignore[no-untyped-def]
+def test_what_is_recorded_of_an_episode_is_of_the_hands_path_as_it_was(known: tuple[Scene, Twin]) -> None:
     arrays, attributes = make_episode(*known, EVERY, 3)
     reach = np.abs(arrays["controllers"] - arrays["controllers"][0]).max()
     assert attributes["control_reach_m"] == pytest.approx(reach, rel=1e-5)

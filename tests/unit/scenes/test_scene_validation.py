@@ -199,6 +199,7 @@ FAULTS: list[tuple[str, Break, str, str]] = [
     ),
     ("grip inverted", grip(region_min_m=[0.1, 0, 0.5]), "region_min_m", "in x"),
     ("grip half", grip(region_max_m=None), "region_min_m", "together"),
+    ("grip open too often", grip(open_s=[[k, k + 0.5] for k in range(1001)]), "open_s", "at most 1000"),
     ("grip open backwards", grip(open_s=[[0.2, 0.1]]), "open_s", "0.2 to 0.1 s"),
     ("grip open twice at once", grip(open_s=[[0.0, 0.2], [0.1, 0.3]]), "open_s", "0.1 to 0.3 s after 0.2 s"),
     ("grip by both", grip(radius_m=0.03), "radius_m", "not both"),

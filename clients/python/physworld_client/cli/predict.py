@@ -93,7 +93,9 @@ def open_times(spans: list[str]) -> list[list[tuple[float, float]]] | None:
         except ValueError as error:
             raise typer.BadParameter(f"{text!r} is not GRIP:BEGIN,END", param_hint="--open") from error
         if not 0 <= number < MOST_GRIPS:
-            raise typer.BadParameter(f"{text!r} is of grip {number}; they count from 0", param_hint="--open")
+            raise typer.BadParameter(
+                f"{text!r} is of grip {number}; they are 0 to {MOST_GRIPS - 1}", param_hint="--open"
+            )
         found.setdefault(number, []).append((begin, end))
     return [found.get(grip, []) for grip in range(max(found) + 1)] if found else None
 
