@@ -24,10 +24,9 @@ from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import clock_times, resample, resample_smooth
 from physworld.worldmodel.errors import ControlsInvalid, GraphInvalid
 from physworld.worldmodel.holding.rollout import HeldVersions
-from physworld.worldmodel.model.skinning import affine_skin
 from physworld.worldmodel.published import PublishedModel
+from physworld.worldmodel.scene_view import carried_points
 
-_SKIN_STATES = 24
 _LENGTHS = 0.1  # by which lengths between the same points of a rope may differ from recording to recording
 _OTHER_SHAPE = 0.1  # of the body's size: a start that is farther away is another shape, not noise
 
@@ -142,9 +141,8 @@ def predict(model: PublishedModel, recording: Scene, twin: Twin) -> ForeignPredi
             f"the recording has {len(times)} ticks of {dt:.4g} s, let go at tick {first}: too few for history {history}"
         )
     particles = twin.simulate(control_times, control_points, times + recording.times[0])
-    vertices, twin_tracks = particles[:, model.spec.particle_index], twin.track(particles)
-    states = np.unique(np.linspace(0, len(times) - 1, _SKIN_STATES).round().astype(np.int64))
-    skin = affine_skin(twin_tracks[states], vertices[states])
+    vertices = particles[:, model.spec.particle_index]
+    skin, twin_tracks = carried_points(twin, particles, vertices, model.spec.rest_vertices)
     controllers = resample(control_points, control_times - recording.times[0], times)
     lift = _lift(model, twin)
     start = vertices[first : first + history + 1]

@@ -9,6 +9,9 @@ Beside the network's tensors (``physworld.worldmodel.model.model``) a version ho
     start.controllers (h+1, K, 3) all controllers at those ticks [m]
     start.time (1,) float64       time of the first of these ticks [s]
     skin.index (N, 8) int64, skin.weight (N, 8)   tracked point = Σ_k weight · vertex[index]
+    skin.slope (2, N, 8), skin.offset, skin.line (N, 3)   where tracked points lie beside a sheet or a rope
+                                  (``physworld.worldmodel.model.skinning.Beside``); the index is then
+                                  skin.beside_index
     phi.strengths.* where the demonstrations varied strengths: ``physworld.worldmodel.model.conditioning``
 
 and the facts (``architecture`` of the card): the ``WorldModelConfig``, ``dt_s``, ``ground_height_m`` (null:
@@ -43,7 +46,7 @@ from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.properties import PhiColumn, columns_of, with_named
-from physworld.worldmodel.model.skinning import Skin
+from physworld.worldmodel.model.skinning import Beside, Skin
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.priors.chain import ChainPrior, straight
 from physworld.worldmodel.priors.modal import ModalPrior
@@ -167,7 +170,7 @@ class PublishedModel:
             "graph.edge_kind": spec.edge_kind,
             "particle.index": spec.particle_index,
             "control.index": spec.control_index,
-            "skin.index": self.skin.index,
+            _skin_index(self.skin.beside is not None): self.skin.index,
         }
         if spec.frame is not None:
             single |= {
@@ -175,6 +178,8 @@ class PublishedModel:
                 "graph.frame_fall": spec.frame.fall,
                 "graph.frame_line": spec.frame.line,
             }
+        if self.skin.beside is not None:
+            single |= {f"skin.{name}": value for name, value in vars(self.skin.beside).items()}
         if spec.current_neighbours:
             whole["graph.current_neighbours"] = np.array([spec.current_neighbours])
         network = {name: value.numpy(force=True) for name, value in self.model.state_dict().items()}
@@ -273,7 +278,7 @@ class PublishedModel:
             start_history=tensors["start.history"].astype(np.float64),
             start_controllers=tensors["start.controllers"].astype(np.float64),
             start_time_s=float(tensors["start.time"][0]),
-            skin=Skin(tensors["skin.index"], tensors["skin.weight"].astype(np.float64)),
+            skin=_skin_of(tensors),
             strengths=Conditioning.read(tensors, facts.get("strengths")),
             grips=tuple(tuple(own) for own in facts.get("grips", ())),
             holding=None if facts.get("holding") is None else tuple(facts["holding"]),
@@ -292,6 +297,21 @@ def _table_name(current_neighbours: int, framed: bool) -> str:
     if framed:
         return "graph.turned_neighbours"
     return "graph.kept_neighbours" if current_neighbours else "graph.neighbours"
+
+
+def _skin_index(beside: bool) -> str:
+    """Tensor of the vertices that carry points: another name where these lie beside them, so that a reader that does
+    not know of it finds none."""
+    return "skin.beside_index" if beside else "skin.index"
+
+
+def _skin_of(tensors: dict[str, Array]) -> Skin:
+    """How vertices carry the tracked points. Raises KeyError, ValueError for tensors that do not fit together."""
+    index, weight = tensors[_skin_index("skin.slope" in tensors)], tensors["skin.weight"].astype(np.float64)
+    if "skin.slope" not in tensors:
+        return Skin(index, weight)
+    slope, offset, line = (tensors[f"skin.{name}"].astype(np.float64) for name in ("slope", "offset", "line"))
+    return Skin(index, weight, Beside(slope, offset, line))
 
 
 def _frame_of(tensors: dict[str, Array]) -> GripFrame | None:
@@ -329,7 +349,14 @@ def _refuse_other_sizes(
     expected |= {"rest.vertices": (n, 3), "particle.index": (n,), "control.index": (controls,)}
     expected |= {table: slots, "graph.edge_kind": slots, "graph.rest_relative": (*slots, 3)}
     expected["start.controllers"] = (frames, tensors["start.controllers"].shape[1], 3)
-    expected["skin.index"] = tensors["skin.weight"].shape
+    carried, points = _skin_index("skin.slope" in tensors), len(tensors["skin.weight"])
+    expected[carried] = tensors["skin.weight"].shape
+    if "skin.slope" in tensors:
+        expected |= {
+            "skin.slope": (2, *expected[carried]),
+            "skin.offset": (points, 3),
+            "skin.line": (points, 3),
+        }
     if spec.frame is not None:
         expected |= {"graph.frame_shape": (controls, 3), "graph.frame_fall": (3,), "graph.frame_line": (3,)}
     if isinstance(prior, ModalPrior):
@@ -348,7 +375,7 @@ def _refuse_other_sizes(
             raise ValueError(
                 f"{name} with {int(np.isnan(values).sum())} of {values.size} values not a number"
             )
-    most = {"skin.index": n, "control.index": tensors["start.controllers"].shape[1]}
+    most = {carried: n, "control.index": tensors["start.controllers"].shape[1]}
     most |= {table: spec.vertex_count + 1, "graph.edge_kind": EDGE_KINDS}
     for name, end in most.items():
         if tensors[name].max(initial=0) >= end:

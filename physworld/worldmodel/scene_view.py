@@ -10,7 +10,7 @@ network's own.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.graph import GraphSpec, build_graph
 from physworld.worldmodel.model.model import WorldModel
-from physworld.worldmodel.model.skinning import Skin, affine_skin
+from physworld.worldmodel.model.skinning import Skin, affine_skin, skin_beside
 from physworld.worldmodel.published import PublishedModel
 
 SKIN_STATES = 24
@@ -127,6 +127,24 @@ class SceneView:
         )
 
 
+def carried_points(twin: Twin, particles: Array, vertices: Array, rest: Array) -> tuple[Skin, Array]:
+    """How vertices of the graph carry the twin's tracked points, and where these are (T, N, 3) [m].
+
+    Args:
+        twin: whose points they are.
+        particles: its particles over time (T, P, 3) [m].
+        vertices: of the graph at the same times (T, n, 3) [m].
+        rest: the same of the undeformed body (n, 3) [m].
+    """
+    tracks = twin.track(particles)
+    states = np.unique(np.linspace(0, len(vertices) - 1, SKIN_STATES).round().astype(np.int64))
+    if twin.form.on_particles or not np.any(twin.body.offsets):
+        return affine_skin(tracks[states], vertices[states]), tracks
+    within = replace(twin, body=replace(twin.body, offsets=np.zeros_like(twin.body.offsets)))
+    skin = affine_skin(within.track(particles)[states], vertices[states])
+    return skin_beside(skin, tracks[states], vertices[states], rest), tracks
+
+
 def view_scene(
     scene: Scene, twin: Twin, config: WorldModelConfig, holding: tuple[int, ...] | None = None
 ) -> SceneView:
@@ -163,9 +181,8 @@ def view_scene(
         ground_height_m=twin.ground_height_m,
         gravity_m_s2=np.asarray(twin.gravity_m_s2),
     )
-    vertices, tracks = particles[:, spec.particle_index], twin.track(particles)
-    states = np.unique(np.linspace(0, len(times) - 1, SKIN_STATES).round().astype(np.int64))
-    skin = affine_skin(tracks[states], vertices[states])
+    vertices = particles[:, spec.particle_index]
+    skin, tracks = carried_points(twin, particles, vertices, spec.rest_vertices)
     return SceneView(
         scene=scene,
         spec=spec,

@@ -23,7 +23,7 @@ from safetensors.numpy import load_file
 from physworld_client.errors import ModelUnreadable
 from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import CARD_NAME, WEIGHTS_NAME, verify_folder
-from physworld_client.network import PROPERTY_COUNT, Network
+from physworld_client.network import OPPOSITE, PROPERTY_COUNT, Network
 from physworld_client.types import Array
 from physworld_schemas.arrays import FARTHEST_M
 from physworld_schemas.wording import reason
@@ -67,6 +67,7 @@ class WorldModel:
     ground_height_m: float | None
     _network: Network
     _skin: tuple[Array, Array] | None
+    _beside: tuple[Array, ...] | None
 
     def __repr__(self) -> str:
         return (
@@ -144,8 +145,12 @@ class WorldModel:
                 f"{name} version {version}: ground height {ground_height_m} against its weights"
             )
         skin = None
-        if "skin.index" in tensors:
-            skin = (tensors["skin.index"], tensor("skin.weight").astype(np.float64))
+        index = "skin.beside_index" if "skin.slope" in tensors else "skin.index"
+        if index in tensors:
+            skin = (tensors[index], tensor("skin.weight").astype(np.float64))
+        beside = None
+        if skin is not None and "skin.slope" in tensors:
+            beside = tuple(tensor(f"skin.{part}").astype(np.float64) for part in ("slope", "offset", "line"))
         return cls(
             name=name,
             version=version,
@@ -162,6 +167,7 @@ class WorldModel:
             ground_height_m=ground_height_m,
             _network=network,
             _skin=skin,
+            _beside=beside,
         )
 
     @property
@@ -245,10 +251,38 @@ class WorldModel:
             raise ModelUnreadable(f"{self.name} version {self.version} carries no measured points")
         index, weight = self._skin
         places = np.asarray(vertices)
-        points: Array = weight[:, :1] * places[..., index[:, 0], :]
-        for k in range(1, index.shape[1]):  # one neighbour at a time: all at once take K times the memory
-            points += weight[:, k, None] * places[..., index[:, k], :]
+        points = _combined(weight, index, places)
+        if self._beside is not None:
+            slope, offset, line = self._beside
+            along, across = (_combined(part, index, places) for part in slope)
+            if np.any(line):
+                points += _turned(offset, line, along)
+            else:
+                points += offset[:, 2:] * _unit(np.cross(along, across))
         return points
+
+
+def _combined(weight: Array, index: Array, places: Array) -> Array:
+    """Σ_k weight_k x_k (…, M, 3), one neighbour at a time: all at once take K times the memory."""
+    total: Array = weight[:, :1] * places[..., index[:, 0], :]
+    for k in range(1, index.shape[1]):
+        total += weight[:, k, None] * places[..., index[:, k], :]
+    return total
+
+
+def _unit(vectors: Array) -> Array:
+    found: Array = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return found
+
+
+def _turned(offset: Array, line: Array, along: Array) -> Array:
+    """Offsets (M, 3) beside a rope, turned as the least turns take ``line`` (M, 3) to ``along`` (…, M, 3)."""
+    goal = _unit(along)
+    axis = np.cross(line, goal)
+    once = np.cross(axis, offset)
+    near = np.maximum(1.0 + (line * goal).sum(axis=-1, keepdims=True), OPPOSITE)
+    turned: Array = offset + once + np.cross(axis, once) / near
+    return turned
 
 
 def _phi_names(name: str, version: int, card: Mapping[str, Any]) -> tuple[str, ...]:

@@ -6,7 +6,9 @@ Two ways:
   p = Σ w_k x_k with Σ w_k = 1, that minimises over the states s at hand
       Σ_s |Σ_k w_k x_k^s - p^s|² + λ Σ_k (w_k - v_k)² / v_k,        v ∝ 1/distance.
   With one state it is exact for every affine motion of a neighbourhood that spans space; with several it
-  also learns what a line or a sheet of vertices hides. It needs no rotation and is linear.
+  also learns what a line or a sheet of vertices hides. It needs no rotation and is linear. A marker on a cloth, or a
+  point on the skin of a rope, lies beside the middle surface or the centre line that the vertices are of, and turns
+  with it (:class:`Beside`), which no such combination does.
 * **Linear blend skinning** as in the paper's appendix, for what also needs an orientation (3D Gaussians):
   weights 1/distance, each vertex moved by its translation and by the rotation that fits its neighbourhood
   best (Kabsch), quaternions blended after their signs are made to agree, which published code forgets.
@@ -16,43 +18,100 @@ Shapes: M points, n vertices, K neighbours; positions in metres. Quaternions (w,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from physworld.arrays import Array
+from physworld.geometry.rigid import least_rotation
 
 RIDGE = 1e-4  # λ in units of the neighbourhood's mean square size: keeps weights near 1/distance where free
 DISTANCE_FLOOR = 1e-3  # of the neighbourhood's size: a point that is a vertex
 ON_A_LINE = 1e-6  # of the neighbourhood's spread along it: rounding across a line, not a shape
 GAPS_AT_ONCE = 2**19  # pairs of a point and a vertex that are looked at together: some 60 MiB
+STRAIGHT = 1e-3  # second over first singular value of rest vertices on a line
+OPPOSITE = 1e-3  # least 1 + cosine of a rope's turn: a line that is turned round has no least turn
 LEAST_TURN = 1e-8  # of the same: weight of turning as little as may be
 
 
 @dataclass(frozen=True)
+class Beside:
+    """Where points lie beside a sheet or a rope, in directions that go along with it.
+
+    u = Σ_k slope_1k x_k and v = Σ_k slope_2k x_k are material directions at the point. Beside a sheet it is at its
+    height along u × v / |u × v|; beside a rope (v = 0) its offset is turned as the least turn takes ``line`` to u.
+
+    Attributes:
+        slope: (2, M, K) [1/m], sums over K of 0; the second is 0 beside a rope.
+        offset: (M, 3) [m]: beside a sheet its last component is the height, the others are 0; beside a rope in world
+            axes where u is along ``line``.
+        line: (M, 3), 0 beside a sheet.
+    """
+
+    slope: Array
+    offset: Array
+    line: Array
+
+    def shift(self, along: Tensor, across: Tensor) -> Tensor:
+        """The offsets (…, M, 3) [m] of directions u and v (…, M, 3)."""
+        offset, line = (
+            torch.as_tensor(a, dtype=along.dtype, device=along.device) for a in (self.offset, self.line)
+        )
+        if not np.any(self.line):
+            normal = torch.linalg.cross(along, across)
+            raised: Tensor = offset[:, 2:] * normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+            return raised
+        along = along / torch.linalg.vector_norm(along, dim=-1, keepdim=True)
+        line, offset = line.expand_as(along), offset.expand_as(along)
+        axis = torch.linalg.cross(line, along)
+        once = torch.linalg.cross(axis, offset)
+        near = (1.0 + (line * along).sum(dim=-1, keepdim=True)).clamp(min=OPPOSITE)
+        turned: Tensor = offset + once + torch.linalg.cross(axis, once) / near
+        return turned
+
+
+@dataclass(frozen=True)
 class Skin:
-    """Vertices ``index`` (M, K) that carry each point, and their ``weight`` (M, K), rows summing to 1."""
+    """Vertices ``index`` (M, K) that carry each point, and their ``weight`` (M, K), rows summing to 1.
+
+    ``beside``: where the points lie beside what the vertices are of; None: in it.
+    """
 
     index: Array
     weight: Array
+    beside: Beside | None = None
 
     def apply(self, vertices: Array) -> Array:
         """Points (…, M, 3) of vertices (…, n, 3)."""
         vertices = np.asarray(vertices)
-        points: Array = self.weight[:, :1] * vertices[..., self.index[:, 0], :]
-        for k in range(
-            1, self.index.shape[1]
-        ):  # one neighbour at a time: all at once take K times the memory
-            points += self.weight[:, k, None] * vertices[..., self.index[:, k], :]
+        points = _combined(self.weight, self.index, vertices)
+        if self.beside is not None:
+            slopes = (torch.from_numpy(_combined(a, self.index, vertices)) for a in self.beside.slope)
+            points += self.beside.shift(*slopes).numpy()
         return points
 
     def apply_torch(self, vertices: Tensor) -> Tensor:
         """The same, differentiable."""
-        weight = torch.as_tensor(self.weight, dtype=vertices.dtype, device=vertices.device)
         moved = vertices[..., torch.as_tensor(self.index, device=vertices.device), :]
-        return (weight[..., None] * moved).sum(dim=-2)
+
+        def combined(weight: Array) -> Tensor:
+            own = torch.as_tensor(weight, dtype=vertices.dtype, device=vertices.device)
+            return (own[..., None] * moved).sum(dim=-2)
+
+        points = combined(self.weight)
+        if self.beside is not None:
+            points = points + self.beside.shift(*(combined(part) for part in self.beside.slope))
+        return points
+
+
+def _combined(weight: Array, index: Array, vertices: Array) -> Array:
+    """Σ_k weight_k x_k (…, M, 3), one neighbour at a time: all at once take K times the memory."""
+    total: Array = weight[:, :1] * vertices[..., index[:, 0], :]
+    for k in range(1, index.shape[1]):
+        total += weight[:, k, None] * vertices[..., index[:, k], :]
+    return total
 
 
 def nearest_vertices(points: Array, vertices: Array, count: int) -> tuple[Array, Array]:
@@ -91,6 +150,38 @@ def affine_skin(points: Array, vertices: Array, neighbours: int = 8) -> Skin:
     system = gram / scale[:, None, None] + RIDGE * penalty
     weight = np.linalg.solve(system, np.ones((*index.shape, 1)))[..., 0]
     return Skin(index, weight / weight.sum(axis=1, keepdims=True))
+
+
+def skin_beside(skin: Skin, points: Array, vertices: Array, rest: Array) -> Skin:
+    """The skin with the offsets that points (S, M, 3) have from where it carries them, as the mean over the states.
+
+    Args:
+        skin: of the places in the sheet or rope beside which the points lie.
+        points: in the states at hand, (S, M, 3) [m].
+        vertices: in the same, (S, n, 3) [m].
+        rest: vertices of the undeformed body (n, 3) [m], on a line or in a plane.
+    """
+    reach = rest[skin.index] - skin.apply(rest)[:, None]
+    near = inverse_distance_weights(np.linalg.norm(reach, axis=2))
+    reach = reach - np.einsum("mk,mkx->mx", near, reach)[:, None]
+    spread, axes = np.linalg.eigh(np.einsum("mk,mkx,mky->mxy", near, reach, reach))
+    spread = np.maximum(spread, np.finfo(np.float64).tiny)
+    slope = np.einsum("mk,mkx,mxj->jmk", near, reach, axes[:, :, :0:-1]) / spread[:, :0:-1].T[..., None]
+    sizes = np.linalg.svd(rest - rest.mean(axis=0), compute_uv=False)
+    line = np.zeros(points.shape[1:])
+    if sizes[1] <= STRAIGHT * sizes[0]:
+        slope[1] = 0.0
+        line = _combined(slope[0], skin.index, vertices[0])
+        line /= np.linalg.norm(line, axis=1, keepdims=True)
+    along, across = (_combined(part, skin.index, vertices) for part in slope)
+    left = points - skin.apply(vertices)
+    if np.any(line):
+        offset = np.einsum("smji,smj->mi", least_rotation(line, along), left) / len(left)
+    else:
+        normal = np.cross(along, across)
+        normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+        offset = np.einsum("smx,smx->m", normal, left)[:, None] / len(left) * np.array([0.0, 0.0, 1.0])
+    return replace(skin, beside=Beside(slope, offset, line))
 
 
 def neighbourhoods(rest: Array, neighbours: int = 8) -> Array:

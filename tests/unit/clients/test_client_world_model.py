@@ -19,10 +19,12 @@ from physworld_client.world_model import WorldModel
 from safetensors.numpy import load_file, save_file
 
 from physworld.worldmodel import PublishedModel, WorldModelConfig, affine_skin, build_graph
+from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.model import WorldModel as Network
+from physworld.worldmodel.model.skinning import Beside
 from physworld.worldmodel.priors.modal import ModalPrior, regressor_count, rigid_prior
 from physworld_storage import signing
 
@@ -166,6 +168,34 @@ def test_both_networks_move_the_same_way(
     points = loaded.track(expected)
     assert points.shape == (FRAMES, 13, 3)
     assert np.abs(points - reference.skin.apply(expected)).max() < 1e-9
+
+
+@pytest.mark.parametrize("rope", [False, True], ids=["sheet", "rope"])
+def test_points_beside_the_vertices_are_where_the_service_has_them(tmp_path: Path, rope: bool) -> None:
+    original = published()
+    rng, shape = np.random.default_rng(3), original.skin.weight.shape
+    slope = rng.normal(size=(2, *shape))
+    slope -= slope.mean(axis=2, keepdims=True)
+    line = rng.normal(size=(shape[0], 3))
+    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    offset = rng.uniform(0.01, 0.02, (shape[0], 3))
+    if rope:
+        slope[1] = 0.0
+    else:
+        line[:], offset[:, :2] = 0.0, 0.0
+    moved = dataclasses.replace(original.skin, beside=Beside(slope, offset, line))
+    write(tmp_path, dataclasses.replace(original, skin=moved))
+    tensors = load_file(tmp_path / "model.safetensors")
+    assert "skin.index" not in tensors, "a reader that does not know of offsets finds no points"
+    reference = PublishedModel.from_tensors(tensors, original.facts())
+    vertices = original.start_history + rng.normal(0.0, 0.01, original.start_history.shape)
+    found = WorldModel.load(tmp_path).track(vertices)
+    assert found == pytest.approx(reference.skin.apply(vertices), abs=1e-12)
+    assert found == pytest.approx(moved.apply(vertices), abs=1e-6)
+    assert np.linalg.norm(found - original.skin.apply(vertices), axis=2).min() > 0.009
+    short = tensors | {"skin.offset": tensors["skin.offset"][:-1]}
+    with pytest.raises(VersionUnreadable, match=r"skin\.offset"):
+        PublishedModel.from_tensors(short, original.facts())
 
 
 def test_the_facts_are_those_of_the_recording(tmp_path: Path) -> None:

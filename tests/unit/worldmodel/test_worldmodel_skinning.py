@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from physworld.geometry.rigid import least_rotation
 from physworld.video import GaussianCarrier, Gaussians
 from physworld.worldmodel.model import skinning
 from physworld.worldmodel.model.skinning import (
@@ -18,6 +19,7 @@ from physworld.worldmodel.model.skinning import (
     nearest_vertices,
     quaternion_of,
     quaternion_product,
+    skin_beside,
 )
 
 RIDGE_ERROR = 5e-3  # of the neighbourhood: what the pull towards 1/distance costs
@@ -64,6 +66,66 @@ def test_torch_and_numpy_agree_and_torch_has_gradients() -> None:
     assert carried.detach().numpy() == pytest.approx(skin.apply(moving.detach().numpy()))
     carried.sum().backward()
     assert float(moving.grad.sum()) == pytest.approx(2 * 15 * 3)
+
+
+def _rolled_up(places: np.ndarray, curvature: float, height: float) -> np.ndarray:
+    """Places (M, 2) of a plane [m], and what lies ``height`` above them, on a cylinder of that curvature: (M, 3)."""
+    if curvature == 0.0:
+        return np.concatenate([places, np.full((len(places), 1), height)], axis=1)
+    angle, radius = curvature * places[:, 0], 1.0 / curvature - height
+    return np.stack([radius * np.sin(angle), places[:, 1], 1.0 / curvature - radius * np.cos(angle)], axis=1)
+
+
+CURVATURES = (0.0, 0.5, 1.0, 2.0)
+HEIGHT_M = 0.05
+
+
+def _beside_a_sheet(turn: Rotation) -> tuple[Skin, np.ndarray, np.ndarray]:
+    """A skin learned from a sheet that is bent a little, and vertices and points of it bent more and turned."""
+    lines = np.linspace(-0.5, 0.5, 25)
+    places, marked = np.array([[x, y] for x in lines for y in lines]), np.array([[0.1, 0.2], [-0.23, 0.31]])
+    sheets = np.stack([_rolled_up(places, c, 0.0) for c in CURVATURES])
+    points = np.stack([_rolled_up(marked, c, HEIGHT_M) for c in CURVATURES])
+    within = np.stack([_rolled_up(marked, c, 0.0) for c in CURVATURES])
+    skin = skin_beside(affine_skin(within[:2], sheets[:2]), points[:2], sheets[:2], sheets[0])
+    return skin, turn.apply(sheets[-1]), turn.apply(points[-1])
+
+
+def test_points_above_a_sheet_go_along_its_normal() -> None:
+    skin, sheet, points = _beside_a_sheet(Rotation.from_rotvec([0.4, 2.0, -1.0]))
+    error = np.linalg.norm(skin.apply(sheet) - points, axis=1)
+    assert error.max() < 0.04 * HEIGHT_M
+    without = np.linalg.norm(Skin(skin.index, skin.weight).apply(sheet) - points, axis=1)
+    assert without.min() > 0.9 * HEIGHT_M
+
+
+def test_points_on_the_skin_of_a_rope_turn_with_its_section() -> None:
+    arcs, marks = np.linspace(0.0, 1.0, 49), np.array([0.22, 0.61])
+    offset = np.array([[0.0, 0.03, 0.02], [0.0, -0.01, 0.04]])
+
+    def bent(at: np.ndarray, curvature: float) -> tuple[np.ndarray, np.ndarray]:
+        """Centre line and its tangents."""
+        angle = curvature * at
+        place = np.stack([np.sin(angle), 1.0 - np.cos(angle), 0.0 * at], axis=1) / curvature
+        return place, np.stack([np.cos(angle), np.sin(angle), 0.0 * at], axis=1)
+
+    states = [1e-6, 0.5, 2.5]
+    ropes, within = (np.stack([bent(at, c)[0] for c in states]) for at in (arcs, marks))
+    tangents = np.stack([bent(marks, c)[1] for c in states])
+    points = within + np.einsum("smij,mj->smi", least_rotation(tangents[0], tangents), offset)
+    rest = np.stack([arcs, 0.0 * arcs, 0.0 * arcs], axis=1)
+    skin = skin_beside(affine_skin(within[:2], ropes[:2]), points[:2], ropes[:2], rest)
+    assert np.linalg.norm(skin.apply(ropes[-1]) - points[-1], axis=1).max() < 1e-3
+    alone = Skin(skin.index, skin.weight).apply(ropes[-1]) - points[-1]
+    assert np.linalg.norm(alone, axis=1).min() > 0.03
+
+
+def test_offsets_of_points_are_the_same_in_torch_and_have_gradients() -> None:
+    skin, sheet, _ = _beside_a_sheet(Rotation.identity())
+    several = torch.tensor(np.stack([sheet, 1.1 * sheet]), requires_grad=True)
+    carried = skin.apply_torch(several)
+    assert carried.detach().numpy() == pytest.approx(skin.apply(several.detach().numpy()), abs=1e-12)
+    assert torch.autograd.gradcheck(skin.apply_torch, (several,), nondet_tol=0.0)
 
 
 def blended(
