@@ -5,8 +5,8 @@ declared physics, traces what it leaves, and trains a world model on the twin wi
 trace added. The card of the second model gives the held-out errors before and after of twin and world model. Recordings
 of the same object that nothing has seen are then held against both versions by assessments.
 
-Two scenes: a rope recorded by another engine whose gravity is tilted without a word of it, and a measured beam of
-silicone. The beam's noise is what its repeat says (``benchmarks.trace.real``), and its frames are thinned as there.
+Three scenes: a rope recorded by another engine whose gravity is tilted without a word of it, a measured beam of
+silicone, and a measured cable. The beam's noise is what its repeat says (``benchmarks.trace.real``), and its frames are thinned as there.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from physworld_schemas.pipeline import PipelineCreate
 UNDECLARED = SHARED.parents[0] / "undeclared"
 EPISODES, STEPS, PARTICLES = 40, 600, 1000
 _BEAM = next(case for case in CASES if case.name == "beam, noise of the repeat")
+_CABLE = next(case for case in CASES if case.name == "rope, shaken up and down")
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,13 @@ def loops(undeclared: Path, real: Path, folder: Path) -> list[Loop]:
     for name in (*_BEAM.fitted, *_BEAM.held_out):
         bundles.append(folder / name)
         write_bundle(replace(read(name, _BEAM, real), noise_sigma_m=sigma), bundles[-1])
-    return [Loop("rope of another engine", blind), Loop("silicone beam", bundles[0], tuple(bundles[1:]))]
+    cable = folder / _CABLE.fitted[0]
+    write_bundle(read(_CABLE.fitted[0], _CABLE, real), cable)
+    return [
+        Loop("rope of another engine", blind),
+        Loop("silicone beam", bundles[0], tuple(bundles[1:])),
+        Loop("cable", cable),
+    ]
 
 
 def close(client: Client, loop: Loop, episodes: int, steps: int, seed: int) -> dict[str, Any]:
