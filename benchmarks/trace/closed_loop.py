@@ -6,7 +6,8 @@ trace added. The card of the second model gives the held-out errors before and a
 of the same object that nothing has seen are then held against both versions by assessments.
 
 Three scenes: a rope recorded by another engine whose gravity is tilted without a word of it, a measured beam of
-silicone, and a measured cable. The beam's noise is what its repeat says (``benchmarks.trace.real``), and its frames are thinned as there.
+silicone, and a measured cable. The beam's noise is what its repeat says (``benchmarks.trace.real``); measured frames
+are thinned as there.
 """
 
 from __future__ import annotations
