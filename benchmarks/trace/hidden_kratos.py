@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.interpolate import CubicSpline, RectBivariateSpline
@@ -27,23 +27,30 @@ from benchmarks.trace.hidden_bodies import (
 )
 from physworld.scene import Body
 
-_ROPE_POISSON, _ROPE_TRACKED, _HELD, _ELEMENTS = 0.4, 40, 3, 40
+ROPE_POISSON, ELEMENTS = 0.4, 40
+_ROPE_TRACKED, _HELD = 40, 3
 _CORNER = 2  # cells of a slab that a hand holds
 
 
 class Strand(Cord):
-    """A rope that is held at both ends."""
+    """A rope of beams, held at both ends."""
+
+    hands: ClassVar[int] = 2
+
+    def mesh(self, top: Floats, along: Floats) -> Any:
+        """Its nodes, and what records them."""
+        from benchmarks.peers.kratos_bodies import rod
+
+        return rod(top, along, self.length_m, self.radius_m, self.young_pa, ROPE_POISSON, self.density_kg_m3,
+                   ELEMENTS)  # fmt: skip
 
     def recorder(self, seed: int, rng: np.random.Generator) -> Recorder:
         """Corotational beams; a camera sees places of the axis."""
-        from benchmarks.peers.kratos_bodies import rod
-
         top = np.array([0.0, 0.0, TOP_M])
         along = np.array(self.way) / np.linalg.norm(self.way)
-        mesh = rod(top, along, self.length_m, self.radius_m, self.young_pa, _ROPE_POISSON, self.density_kg_m3,
-                   _ELEMENTS)  # fmt: skip
+        mesh = self.mesh(top, along)
         seen = np.sort(rng.uniform(0.0, 1.0, _ROPE_TRACKED))
-        ends = [np.arange(_HELD), len(mesh.nodes) - 1 - np.arange(_HELD)]
+        ends = [np.arange(_HELD), len(mesh.nodes) - 1 - np.arange(_HELD)][: self.hands]
         motions = [Motion(10 * seed + g, self.stroke_m, self.turn_rad) for g in range(len(ends))]
         room = self.radius_m * np.sqrt(1.0 - along**2)
         shares = np.linspace(0.0, 1.0, len(mesh.nodes))
@@ -63,13 +70,18 @@ class Strand(Cord):
 class Slab(Cloth):
     """A plate that hangs by two corners."""
 
-    def recorder(self, seed: int, rng: np.random.Generator) -> Recorder:
-        """Corotational shells; a camera sees places of the middle surface."""
+    def mesh(self, corner: Floats) -> Any:
+        """Its nodes from its lowest corner (3,) [m] on, and what records them."""
         from benchmarks.peers.kratos_bodies import plate
 
         width, thickness, height = self.size_m
+        return plate(corner, width, height, self.cells, thickness, self.young_pa, POISSON, self.density_kg_m3)
+
+    def recorder(self, seed: int, rng: np.random.Generator) -> Recorder:
+        """Corotational shells; a camera sees places of the middle surface."""
+        width, thickness, height = self.size_m
         corner = np.array([-0.5 * width, 0.0, TOP_M - height])
-        mesh = plate(corner, width, height, self.cells, thickness, self.young_pa, POISSON, self.density_kg_m3)
+        mesh = self.mesh(corner)
         across, up = (np.linspace(0.0, 1.0, count + 1) for count in self.cells)
         unit = (mesh.nodes - corner)[:, [0, 2]] / [width, height]
         reach = _CORNER / np.array(self.cells) + 1e-9

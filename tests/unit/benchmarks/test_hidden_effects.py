@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks.trace.hidden_effects import cases, page, scored
+from benchmarks.trace.hidden_cases import cases
+from benchmarks.trace.hidden_effects import page, scored
 
 CASES = {case.name: case for case in cases()}
 

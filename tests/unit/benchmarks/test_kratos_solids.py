@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.peers.finite_elements import Acting
 from benchmarks.trace import hidden_effects
-from benchmarks.trace.hidden_effects import solid_cases
+from benchmarks.trace.hidden_cases import solid_cases
 from benchmarks.trace.hidden_solids import (
     ALLOWED_M,
     SOLIDS,
