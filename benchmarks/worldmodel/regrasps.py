@@ -56,6 +56,7 @@ def main() -> int:
     parser.add_argument("--cells", type=Path, default=CELLS, help="keeps the episodes")
     parser.add_argument("--bodies", nargs="*", default=[*BODIES], choices=[*BODIES])
     parser.add_argument("--taught", type=int, default=TAUGHT, help="episodes to learn from")
+    parser.add_argument("--frames", type=int, default=TAUGHT_FRAMES, help="of each of them")
     parser.add_argument("--steps", type=int, default=600, help="of each training")
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -63,7 +64,7 @@ def main() -> int:
     rows = {row["body"]: row for row in known}
     for name in given.bodies:
         if name not in rows:
-            rows[name] = cell(name, given.cells, given.taught, given.steps)
+            rows[name] = cell(name, given.cells, given.taught, given.frames, given.steps)
     report = report_of([rows[name] for name in BODIES if name in rows], given.taught)
     print(report.markdown())
     write_json(report, given.json)
@@ -72,11 +73,11 @@ def main() -> int:
     return 0
 
 
-def cell(name: str, folder: Path, taught: int, steps: int) -> dict[str, Any]:
+def cell(name: str, folder: Path, taught: int, frames: int, steps: int) -> dict[str, Any]:
     """Errors of a body's models on the judged episodes, and of the baselines."""
     scene, twin = BODIES[name]()
-    learned = episodes_of(name, scene, twin, folder, "taught", taught)
-    judged = episodes_of(name, scene, twin, folder, "judged", JUDGED)
+    learned = episodes_of(name, scene, twin, folder, "taught", taught, frames)
+    judged = episodes_of(name, scene, twin, folder, "judged", JUDGED, JUDGED_FRAMES)
     specs = {
         grips: build_graph(
             twin.particles_rest,
@@ -137,14 +138,16 @@ def cell(name: str, folder: Path, taught: int, steps: int) -> dict[str, Any]:
     }
 
 
-def episodes_of(name: str, scene: Scene, twin: Twin, folder: Path, part: str, count: int) -> list[Made]:
+def episodes_of(
+    name: str, scene: Scene, twin: Twin, folder: Path, part: str, count: int, frames: int
+) -> list[Made]:
     """Demonstrations of a part, made once."""
     config = DemonstrationConfig(
-        frames=TAUGHT_FRAMES if part == "taught" else JUDGED_FRAMES,
+        frames=frames,
         replay_share=0.0,
         regrasp_share=0.7 if part == "taught" else 1.0,
     )
-    path = folder / f"regrasp-{name}-{part}-{count}.npz"
+    path = folder / f"regrasp-{name}-{part}-{count}-{frames}.npz"
     if not path.exists():
         first = 0 if part == "taught" else 10**6
         made = [make_episode(scene, twin, config, derived_seed(first, k))[0] for k in range(count)]
