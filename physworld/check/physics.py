@@ -22,10 +22,11 @@ from physworld.calibrate.cloths import cloth_parameters, with_priors
 from physworld.calibrate.global_stage import prior_twin, searched_parameters
 from physworld.calibrate.parameters import Parameter
 from physworld.calibrate.rod_parameters import LOSSES, rod_parameters, steps_seen
+from physworld.effects.clamp_offset import REACH
 from physworld.estimation.unknowns import LOG, Unknown, at, multiple_of, starts_of
 from physworld.geometry.sheet_body import is_hung_sheet
 from physworld.scene import Scene
-from physworld.trace.unknowns import KNOWN_BEFOREHAND, REACH, hold_unknowns, of_parameter
+from physworld.trace.unknowns import KNOWN_BEFOREHAND, hold_unknowns, of_parameter
 from physworld.twin.grips import softly_held
 from physworld.twin.twin import Twin
 

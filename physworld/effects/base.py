@@ -53,6 +53,23 @@ class Strength:
 
 
 @dataclass(frozen=True)
+class Calibrated:
+    """A strength that is calibrated whatever acts: how a grip holds, which no lattice knows.
+
+    Attributes:
+        strength: with the range in which it is no effect of its own.
+        step: of finite differences, in its unit.
+        spread: deviation about zero of what is known beforehand.
+        start: where a search begins.
+    """
+
+    strength: Strength
+    step: float
+    spread: float
+    start: float = 0.0
+
+
+@dataclass(frozen=True)
 class Variant:
     """One form in which a trace tries an effect: a linear score is taken of its gates, with its shape fixed.
 
@@ -119,6 +136,11 @@ class Effect:
     def variants(cls, twin: Twin) -> list[Variant]:
         """The forms in which a trace tries the effect on this twin: by default one, with every gate free."""
         return [Variant(tuple(s.name for s in cls.strengths(twin) if s.gate))]
+
+    @classmethod
+    def calibrated(cls, twin: Twin) -> Calibrated | None:
+        """A strength that every fit of this twin has within a range, whatever acts; by default none."""
+        return None
 
     @classmethod
     def mirror(cls, twin: Twin) -> Mirror | None:

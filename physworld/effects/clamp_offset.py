@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from physworld.arrays import Array
-from physworld.effects.base import Effect, Strength, Variant
+from physworld.effects.base import Calibrated, Effect, Strength, Variant
 from physworld.effects.places import body_size, held_count
 from physworld.engine.problem import Problem
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from physworld.twin.twin import Twin
 
 _LEAST_COMPLIANCE = 0.25
+_STEP, _SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
+REACH = "clamp_offset.reach_m"
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,19 @@ class ClampOffset(Effect):
         angles = Variant(("angle_x_rad", "angle_y_rad", "angle_z_rad"), "angle_x_rad")
         reach = [Variant(("reach_m",), "reach_m")] if twin.grip_softness == 0 else []
         return [*reach, angles]
+
+    @classmethod
+    def calibrated(cls, twin: Twin) -> Calibrated | None:
+        """How far clamps hold, within a cell; of soft grips that is their softness, a mesh's lines lie on the faces.
+
+        Within its thickness for a body thicker than its cells: what it does next to a clamp no plate and no rod does.
+        """
+        if twin.grip_softness > 0 or not twin.lattice.smooth or cls.refuses(twin) is not None:
+            return None
+        cell = max(float(twin.lattice.spacing.max()), 2.0 * twin.body.half_thickness_m)
+        reach = next(s for s in cls.strengths(twin) if s.name == "reach_m")
+        within = replace(reach, low=max(reach.low, -cell), high=min(reach.high, cell))
+        return Calibrated(within, _STEP * cell, _SPREAD * cell)
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:

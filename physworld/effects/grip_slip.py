@@ -17,18 +17,20 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from physworld.arrays import Array
-from physworld.effects.base import Effect, Strength
+from physworld.effects.base import Calibrated, Effect, Strength
 from physworld.effects.places import gravity_size, held_count
 from physworld.engine.problem import HeldNodes, Problem, nodal_mass
 from physworld.engine.terms.term import BoundTerm
 from physworld.engine.total.node_kernels import on_path
 from physworld.engine.updated.grips import particle_grips
 from physworld.engine.updated.terms import ParticleBody
+from physworld.materials.rod import RodLaw
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
 
 
+_STEP = 0.25  # of a sheared rope's compliance
 _SOFT = 1 / 200  # cells: softer grips are no small change from springs on nodes that are all held
 
 
@@ -144,6 +146,24 @@ class GripSlip(Effect):
             Strength("compliance_m_n", "m/N", 0.0, high, probe),
             Strength("damping_ratio", "1", 0.0, 2.0, 0.1, gate=False, start=0.5),
         )
+
+    @classmethod
+    def calibrated(cls, twin: Twin) -> Calibrated | None:
+        """How far a rope's grips give, up to what its shear does there.
+
+        Rods here do not shear. One that does is displaced by a sideways force F next to a grip by
+        F sqrt(B/T) / (k G A): under the tension T it shears over the length sqrt(B/T) along which it bends
+        (Timoshenko 1921; B = E I, and k G A is about 0.3 E A of a round section). That is a compliance of
+        r^2 / (1.2 sqrt(B T)), with the rope's weight for T. A search starts at a quarter of it: a grip that is
+        nearly rigid is so for every small change.
+        """
+        if not isinstance(twin.law, RodLaw) or cls.refuses(twin) is not None:
+            return None
+        weight = float(twin.particle_mass.sum()) * gravity_size(twin)
+        sheared = twin.body.thickness_m**2 / (1.2 * float(np.sqrt(twin.law.bending_n_m2 * weight)))
+        known = next(s for s in cls.strengths(twin) if s.name == "compliance_m_n")
+        step = _STEP * sheared
+        return Calibrated(replace(known, high=sheared), step, sheared, start=step)
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:

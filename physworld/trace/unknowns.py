@@ -8,23 +8,14 @@ import numpy as np
 
 from physworld.calibrate.parameters import BENDING_RATIO, TWIST_RATIO, Parameter, bending_ratio
 from physworld.effects.base import Strength
-from physworld.effects.clamp_offset import ClampOffset
-from physworld.effects.grip_slip import GripSlip
-from physworld.effects.places import gravity_size
 from physworld.effects.registry import EFFECTS
 from physworld.engine.terms.soft_grips import AS_HELD
 from physworld.estimation.unknowns import LOG, Unknown, multiple_of
-from physworld.materials.rod import RodLaw
 from physworld.twin.twin import Twin
 
-CLAMP = ClampOffset.name
 SOFTNESS = "grip_softness"
-REACH = f"{CLAMP}.reach_m"
-SLIP = GripSlip.name
-_SLIP_STEP = 0.25  # of a sheared rope's compliance
 _SOFTNESS_SHARES = (0.1, 1.5)  # of ``AS_HELD``: finite elements as large as the grip hold so much harder
 _SOFTNESS_STEP = 0.1
-_CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
 KNOWN_BEFOREHAND = {"poissons_ratio": 0.08, "stretching_n": 1.0, TWIST_RATIO: 0.7, BENDING_RATIO: 0.5}
 """Deviations of what is known of a parameter before any recording, about the twin's value, in the scale of the search:
 of soft solids, of a taut rope, and of a sheet's bending over that of a homogeneous plate of its thickness."""
@@ -87,20 +78,6 @@ def of_strength(
     )
 
 
-def clamp_reach(twin: Twin) -> Unknown | None:
-    """How far the clamps hold, within a cell: no lattice knows it better, so it is calibrated. None without one.
-
-    Within its thickness for a body thicker than its cells: what it does next to a clamp no plate and no rod does.
-    """
-    clamp = EFFECTS[CLAMP]
-    if clamp.refuses(twin) is not None:
-        return None
-    cell = max(float(twin.lattice.spacing.max()), 2.0 * twin.body.half_thickness_m)
-    reach = next(s for s in clamp.strengths(twin) if s.name == "reach_m")
-    known = replace(reach, low=max(reach.low, -cell), high=min(reach.high, cell))
-    return of_strength(CLAMP, known, _CLAMP_STEP * cell, spread=_CLAMP_SPREAD * cell)
-
-
 def grip_softness(twin: Twin) -> Unknown | None:
     """Over how many cells grips take hold, as a logarithm; None for a twin whose grips prescribe nodes.
 
@@ -118,29 +95,13 @@ def grip_softness(twin: Twin) -> Unknown | None:
     return unknown.starting(float(np.log(twin.grip_softness)))
 
 
-def grip_compliance(twin: Twin) -> Unknown | None:
-    """How far a rope's grips give, up to what its shear does there; None without a grip or a rope.
-
-    Rods here do not shear. One that does is displaced by a sideways force F next to a grip by F sqrt(B/T) / (k G A):
-    under the tension T it shears over the length sqrt(B/T) along which it bends (Timoshenko 1921; B = E I, and k G A is
-    about 0.3 E A of a round section). That is a compliance of r^2 / (1.2 sqrt(B T)), with the rope's weight for T. A
-    search starts at a quarter of it: a grip that is nearly rigid is so for every small change.
-    """
-    slip = EFFECTS[SLIP]
-    weight = float(twin.particle_mass.sum()) * gravity_size(twin)
-    if not isinstance(twin.law, RodLaw) or slip.refuses(twin) is not None:
-        return None
-    sheared = twin.body.thickness_m**2 / (1.2 * float(np.sqrt(twin.law.bending_n_m2 * weight)))
-    known = next(s for s in slip.strengths(twin) if s.name == "compliance_m_n")
-    step = _SLIP_STEP * sheared
-    return of_strength(SLIP, replace(known, high=sheared), step, start=step, spread=sheared)
-
-
 def hold_unknowns(twin: Twin) -> list[Unknown]:
-    """How the twin's grips hold it: a reach within a cell is what softness is, a mesh's lines lie on their faces."""
-    softness = grip_softness(twin)
-    reach = clamp_reach(twin) if softness is None and twin.lattice.smooth else None
-    return [unknown for unknown in (reach, softness, grip_compliance(twin)) if unknown is not None]
+    """How the twin's grips hold it: their softness, and what effects say of how far they hold and give."""
+    found = [grip_softness(twin)]
+    for name, kind in EFFECTS.items():
+        if (own := kind.calibrated(twin)) is not None:
+            found.append(of_strength(name, own.strength, own.step, own.start, own.spread))
+    return [unknown for unknown in found if unknown is not None]
 
 
 def already(twin: Twin, gate: Unknown) -> float:

@@ -13,7 +13,7 @@ from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.scene import UNDEFORMED_AT_REST, Body, Scene
 from physworld.trace import TraceConfig, TraceResult, trace
-from physworld.trace.unknowns import grip_compliance
+from physworld.trace.unknowns import hold_unknowns
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
@@ -50,11 +50,12 @@ def sheared() -> float:
 
 
 def test_the_compliance_that_is_calibrated_goes_up_to_what_the_shear_of_a_round_rope_does() -> None:
-    known = grip_compliance(twin_of(rope()))
-    assert known is not None and known.prior is not None and known.low == 0.0
+    known = {u.name: u for u in hold_unknowns(twin_of(rope()))}["grip_slip.compliance_m_n"]
+    assert known.prior is not None and known.low == 0.0
     assert known.value(known.prior[1]) == pytest.approx(sheared(), rel=0.15)
     assert known.high == pytest.approx(sheared(), rel=0.15)
-    assert grip_compliance(build_twin(sagging(), 60)) is None  # a bar is no rope
+    of_bar = [u.name for u in hold_unknowns(build_twin(sagging(), 60))]
+    assert "grip_slip.compliance_m_n" not in of_bar  # a bar is no rope
 
 
 def traced(compliance_m_n: float) -> TraceResult:
