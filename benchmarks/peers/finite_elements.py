@@ -187,3 +187,16 @@ def record(
                 raise FloatingPointError(f"the recording blew up before {now:.3g} s at steps of {step:.3g} s")
             frames.append(x.copy())
     return np.stack(frames)
+
+
+def quadrilaterals(
+    corner: Floats, width_m: float, height_m: float, cells: tuple[int, int]
+) -> tuple[Floats, np.ndarray]:
+    """Nodes (n, 3) [m] of a plate in the plane of x and z from its lowest ``corner`` (3,) [m], and its cells (m, 4)."""
+    across, up = np.meshgrid(
+        np.linspace(0.0, width_m, cells[0] + 1), np.linspace(0.0, height_m, cells[1] + 1)
+    )
+    nodes = corner + np.stack([across.ravel(), np.zeros(across.size), up.ravel()], axis=1)
+    number = np.arange(across.size).reshape(across.shape)
+    corners = (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1])
+    return nodes, np.stack([c.ravel() for c in corners], axis=1)

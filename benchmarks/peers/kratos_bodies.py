@@ -17,7 +17,7 @@ import KratosMultiphysics.StructuralMechanicsApplication as Structures
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.peers.finite_elements import Acting, Floats, Place
+from benchmarks.peers.finite_elements import Acting, Floats, Place, quadrilaterals
 
 _STEP_S = 1.0 / 480.0  # at most
 _TOLERANCE, _LEFT_N, _ITERATIONS = 1e-3, 3e-6, 60
@@ -169,17 +169,12 @@ def plate(corner: Floats, width_m: float, height_m: float, cells: tuple[int, int
           poisson: float, density_kg_m3: float) -> Mesh:  # fmt: skip
     """A plate in the plane of x and z from its lowest ``corner`` (3,) [m], of corotational
     shells that do not shear."""
-    across, up = np.meshgrid(
-        np.linspace(0.0, width_m, cells[0] + 1), np.linspace(0.0, height_m, cells[1] + 1)
-    )
-    nodes = corner + np.stack([across.ravel(), np.zeros(across.size), up.ravel()], axis=1)
-    number = np.arange(across.size).reshape(across.shape)
-    corners = (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1])
+    nodes, quads = quadrilaterals(corner, width_m, height_m, cells)
     properties = {
         Kratos.DENSITY: density_kg_m3, Kratos.YOUNG_MODULUS: young_pa, Kratos.POISSON_RATIO: poisson,
         Kratos.THICKNESS: thickness_m,
     }  # fmt: skip
-    return Mesh(nodes, np.stack([c.ravel() for c in corners], axis=1), "ShellThinElementCorotational3D4N",
+    return Mesh(nodes, quads, "ShellThinElementCorotational3D4N",
                 Structures.LinearElasticPlaneStress2DLaw, properties, True)  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import opensees.openseespy as opensees
 
-from benchmarks.peers.finite_elements import Acting, Floats, Place
+from benchmarks.peers.finite_elements import Acting, Floats, Place, quadrilaterals
 
 _BEAM_STEP_S, _SHELL_STEP_S = 1.0 / 1920.0, 1.0 / 960.0
 _MOVED_M, _ITERATIONS = 1e-10, 40
@@ -142,13 +142,7 @@ def rod(top: Floats, way: Floats, length_m: float, radius_m: float, young_pa: fl
 def plate(corner: Floats, width_m: float, height_m: float, cells: tuple[int, int], thickness_m: float, young_pa: float,
           poisson: float, density_kg_m3: float) -> Mesh:  # fmt: skip
     """A plate in the plane of x and z from its lowest ``corner`` (3,) [m], of corotational shells."""
-    across, up = np.meshgrid(
-        np.linspace(0.0, width_m, cells[0] + 1), np.linspace(0.0, height_m, cells[1] + 1)
-    )
-    nodes = corner + np.stack([across.ravel(), np.zeros(across.size), up.ravel()], axis=1)
-    number = np.arange(across.size).reshape(across.shape)
-    corners = (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1])
-    quads = np.stack([c.ravel() for c in corners], axis=1)
+    nodes, quads = quadrilaterals(corner, width_m, height_m, cells)
     share = np.zeros(len(nodes))
     np.add.at(share, quads.ravel(), width_m * height_m / len(quads) / 4.0)
     mass = density_kg_m3 * thickness_m * share

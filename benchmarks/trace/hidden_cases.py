@@ -167,14 +167,7 @@ def fresh_cases() -> tuple[Case, ...]:
         ("capped_blob", lag(9)),
         ("calm_slab", lag(10)),
     )
-    return tuple(
-        case
-        for k, (body, acts) in enumerate(pairs, start=1)
-        for case in (
-            Case(f"f{2 * k - 1:02d}", body, 300 + 2 * k - 1, answers=("nothing_to_explain",)),
-            Case(f"f{2 * k:02d}", body, 300 + 2 * k, acts),
-        )
-    )
+    return _in_pairs("f", 300, pairs)
 
 
 def opensees_cases() -> tuple[Case, ...]:
@@ -195,12 +188,20 @@ def opensees_cases() -> tuple[Case, ...]:
         ("strung line", {"gravity_tilt": {"degrees": drawn(9, 3.0, 6.0), "axis": [1.0, 0.4, 0.0]}}),
         ("hung line", {"linear_drag": {"c": drawn(10, 1.0, 2.5)}}),
     )
+    return _in_pairs("o", 400, acting)
+
+
+def _in_pairs(
+    letter: str, seed: int, acting: tuple[tuple[str, dict[str, dict[str, Any]]], ...]
+) -> tuple[Case, ...]:
+    """For each body and what acts on it a case without an effect and one with it."""
+    silent = ("nothing_to_explain",)
     return tuple(
         case
         for k, (body, acts) in enumerate(acting, start=1)
         for case in (
-            Case(f"o{2 * k - 1:02d}", body, 400 + 2 * k - 1, answers=("nothing_to_explain",)),
-            Case(f"o{2 * k:02d}", body, 400 + 2 * k, acts),
+            Case(f"{letter}{2 * k - 1:02d}", body, seed + 2 * k - 1, answers=silent),
+            Case(f"{letter}{2 * k:02d}", body, seed + 2 * k, acts),
         )
     )
 

@@ -31,6 +31,7 @@ from physworld_schemas.wording import reason
 CARD_SCHEMA = 1
 PHI_NAMES = ("stiffness", "density")
 """Columns of Φ, which the weights take in this order."""
+_SHORTEST = 1e-12  # of a direction: shorter ones are none
 
 
 @dataclass(frozen=True, repr=False)
@@ -271,7 +272,7 @@ def _combined(weight: Array, index: Array, places: Array) -> Array:
 
 
 def _unit(vectors: Array) -> Array:
-    found: Array = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    found: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _SHORTEST)
     return found
 
 

@@ -33,6 +33,7 @@ ON_A_LINE = 1e-6  # of the neighbourhood's spread along it: rounding across a li
 GAPS_AT_ONCE = 2**19  # pairs of a point and a vertex that are looked at together: some 60 MiB
 STRAIGHT = 1e-3  # second over first singular value of rest vertices on a line
 OPPOSITE = 1e-3  # least 1 + cosine of a rope's turn: a line that is turned round has no least turn
+SHORTEST = 1e-12  # of a direction: shorter ones are none
 LEAST_TURN = 1e-8  # of the same: weight of turning as little as may be
 
 
@@ -61,9 +62,9 @@ class Beside:
         )
         if not np.any(self.line):
             normal = torch.linalg.cross(along, across)
-            raised: Tensor = offset[:, 2:] * normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+            raised: Tensor = offset[:, 2:] * _unit(normal)
             return raised
-        along = along / torch.linalg.vector_norm(along, dim=-1, keepdim=True)
+        along = _unit(along)
         line, offset = line.expand_as(along), offset.expand_as(along)
         axis = torch.linalg.cross(line, along)
         once = torch.linalg.cross(axis, offset)
@@ -104,6 +105,12 @@ class Skin:
         if self.beside is not None:
             points = points + self.beside.shift(*(combined(part) for part in self.beside.slope))
         return points
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """Unit vectors (…, 3); 0 of a neighbourhood that has collapsed, which has no direction."""
+    found: Tensor = vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True).clamp(min=SHORTEST)
+    return found
 
 
 def _combined(weight: Array, index: Array, vertices: Array) -> Array:

@@ -126,6 +126,7 @@ def test_offsets_of_points_are_the_same_in_torch_and_have_gradients() -> None:
     carried = skin.apply_torch(several)
     assert carried.detach().numpy() == pytest.approx(skin.apply(several.detach().numpy()), abs=1e-12)
     assert torch.autograd.gradcheck(skin.apply_torch, (several,), nondet_tol=0.0)
+    assert np.isfinite(skin.apply(np.zeros_like(sheet))).all(), "a sheet that has collapsed has no normal"
 
 
 def blended(
