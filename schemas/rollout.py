@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from physworld_schemas.arrays import MAX_LISTED_VALUES, ArrayInput, EncodedArray
 from physworld_schemas.base import Artifact, Lineage, Request, Resource
@@ -24,6 +24,7 @@ VersionName = Annotated[str, Field(pattern=r"^([1-9][0-9]{0,8}|[a-z][a-z0-9_-]{0
 Version = Annotated[int, Field(ge=1, lt=2**31)] | VersionName
 Start = Literal["recording", "rest"]
 Part = Literal["points", "vertices"]
+Predictor = Literal["model", "twin"]
 RunState = Literal["pending", "ready", "failed", "cancelled"]
 
 
@@ -35,6 +36,8 @@ class RolloutCreate(Request):
     h + 1 ticks belong to the model's history; with "rest" the body lies still where the recording begins until the
     second tick. ``dt_s``, where given, must be the model's. ``phi`` are log ratios of stiffness and
     density to the calibrated ones, (n, 2) or (B, n, 2), the fine-tuned ones without it; the factors come on top.
+    ``by`` "twin": the calibrated twin that the version learned from is simulated instead of its network, always as a
+    job; it has no ``phi``.
     """
 
     model: ModelName = Field(description="Name of the model.", examples=["soft_beam"])
@@ -102,6 +105,18 @@ class RolloutCreate(Request):
     mode: Literal["auto", "job"] = Field(
         default="auto", description="Answer at once where it is small, or always as a job."
     )
+    by: Predictor = Field(
+        default="model",
+        description="Who predicts: the version's network, or the calibrated twin that it learned from (a job).",
+    )
+
+    @model_validator(mode="after")
+    def _the_twin_has_no_phi(self) -> Self:
+        if self.by == "twin" and self.phi is not None:
+            raise ValueError(
+                "phi is of the graph's vertices, which the twin has not: give stiffness_factor and density_factor"
+            )
+        return self
 
 
 class Rollout(Resource):
@@ -116,6 +131,9 @@ class Rollout(Resource):
     state: RunState = Field(default="ready", description="Whether the answer is there.")
     model: str = Field(description="Name of the model.", examples=["soft_beam"])
     version: int = Field(description="Version of the model.")
+    by: Predictor = Field(
+        default="model", description="Who predicted: the network, or the twin it learned from."
+    )
     created_at: datetime | None = Field(default=None, description="When it was made, UTC.")
     job_id: str | None = Field(
         default=None, description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]

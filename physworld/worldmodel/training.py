@@ -10,7 +10,8 @@ and resumed from a checkpoint; on CUDA, where sums have no order of their own, t
 
 A slack rope or a body that snaps through has sub-sequences in which a gradient grows without end over the unrolled
 frames. A step whose gradient is ``EXPLODED`` times the usual one, or no number, is left out and counted;
-``MOST_LEFT_OUT`` in a row are a training that diverged.
+``MOST_LEFT_OUT`` in a row are a training that diverged: it ends, and what is returned is the best network before, if
+any was better than the prior alone.
 
 **While episodes still arrive** (``start_share`` below 1): the first share of the episodes by index is enough to begin.
 Validation episodes, scales and prior come from it and stay. The others join in the order of their index at steps
@@ -64,7 +65,8 @@ class TrainingResult:
 
     ``prior``: which one is under the network; ``prior_errors_m``: open-loop errors of those that were tried;
     ``steps``: taken, fewer than asked for where the patience ended; ``steps_left_out`` of them for an exploding
-    gradient; ``episodes``: trained or validated on.
+    gradient; ``diverged_at``: the step from which on it diverged, None where it did not; ``episodes``: trained or
+    validated on.
     """
 
     model: WorldModel
@@ -78,6 +80,7 @@ class TrainingResult:
     static_error_m: float
     steps: int
     steps_left_out: int
+    diverged_at: int | None
     episodes: int
 
 
@@ -151,6 +154,11 @@ def train(
         network: builds it from the arguments of :class:`WorldModel`.
         start: a model, perhaps of another body, whose weights it goes on from (:meth:`WorldModel.take`, which may
             raise NetworkMismatch); the first two validations are then of the prior alone and of these weights.
+
+    Raises:
+        DatasetUnusable: there is nothing to learn from.
+        TrainingDiverged: gradients exploded before any network was better than the prior alone.
+        TrainingCancelled, NetworkMismatch: see the arguments.
     """
     if not tracks:
         raise DatasetUnusable("no episode to train on")
@@ -193,7 +201,7 @@ def train(
             run.average.take(start)
             _validate(run, held_out, validated)
     joined = first
-    sampler = WindowSampler(fitting)
+    sampler, diverged_at = WindowSampler(fitting), None
     while run.step < training.steps and not _out_of_patience(run, training):
         if cancelled is not None and cancelled():
             raise TrainingCancelled(run.step)
@@ -204,7 +212,13 @@ def train(
             used += sum(map(bool, joining))
             sampler, joined = WindowSampler(fitting), present
         longest = max(sampler.lengths) - config.history - 1
-        _train_step(run, sampler, training, min(training.look_ahead, longest))
+        try:
+            _train_step(run, sampler, training, min(training.look_ahead, longest))
+        except TrainingDiverged as error:
+            if run.best_step == 0:
+                raise
+            diverged_at = error.step
+            break
         run.step += 1
         if run.step % training.validation_every == 0 or run.step == training.steps:
             run.losses.append((run.step, run.loss))
@@ -226,6 +240,7 @@ def train(
         static_error_m=mean_error([_static(track, config.history) for track in held_out], held_out, spec),
         steps=run.step,
         steps_left_out=run.left_out,
+        diverged_at=diverged_at,
         episodes=used,
     )
 

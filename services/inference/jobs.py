@@ -11,20 +11,20 @@ from typing import Any
 from physworld_schemas.base import Reference
 from physworld_schemas.plan import PlanCreate
 from physworld_schemas.rollout import RolloutCreate
-from physworld_services.inference import rollouts
+from physworld_services.inference import rollouts, twin_rollouts
 from physworld_services.inference.models import Models
 from physworld_storage import registry
 from physworld_storage.runs import RESULT
 from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
 from physworld_workers.stores import Stores
-from physworld_workers.tasks.inputs import made_from, npz_bytes
+from physworld_workers.tasks.inputs import made_from, npz_bytes, scene_of, twin_of
 
 NPZ = "application/vnd.numpy.npz"
 
 
 def rollout(context: TaskContext, stores: Stores) -> HandlerResult:
-    """Predict every candidate; the answer lies in ``rollout.npz``."""
+    """Predict every candidate, by the network or by the twin; the answer lies in ``rollout.npz``."""
     payload = context.lease.payload
     asked = RolloutCreate.model_validate_json(stores.artifacts.read_bytes(payload["request"]))
     version, model = models_of(stores).get(payload["model"], payload["version"])
@@ -35,11 +35,20 @@ def rollout(context: TaskContext, stores: Stores) -> HandlerResult:
         context.check()
         context.progress(done, total, "steps")
 
-    arrays, seconds = rollouts.run(asked, model, prepared, progress=progress)
+    made_of: list[dict[str, Any]] = []
+    if asked.by == "twin":
+        own = {"scene_id": version.scene_id, "fit_id": version.fit_id, "trace_id": version.trace_id}
+        made_of = [item.model_dump(mode="json") for item in made_from(stores, own)]
+        twin = twin_of(stores, str(version.fit_id), version.trace_id)
+        scene = scene_of(stores, str(version.scene_id))
+        arrays, seconds = twin_rollouts.run(asked, model, prepared, twin, scene, progress=progress)
+    else:
+        arrays, seconds = rollouts.run(asked, model, prepared, progress=progress)
     content = npz_bytes({"times": prepared.times, **arrays})
     made = stores.artifacts.put_bytes(content, RESULT["rollout"], NPZ)
     figures = {**rollouts.facts(asked, model, prepared), "seconds": seconds, "sha256": version.sha256}
-    return _result(payload, figures, [made.model_dump(mode="json")], version.sha256, {}, made.sha256)
+    artifacts = [made.model_dump(mode="json")]
+    return _result(payload, figures, artifacts, version.sha256, {}, made.sha256, made_of)
 
 
 def plan(context: TaskContext, stores: Stores) -> HandlerResult:

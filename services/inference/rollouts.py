@@ -1,6 +1,6 @@
 """From a request for a rollout to its arrays: checks against the model, clock, start, properties, the engine.
 
-The same code answers at once (``app``) and as a job (``jobs``).
+The same code answers at once (``app``) and as a job (``jobs``); a rollout by the twin is a job (``twin_rollouts``).
 """
 
 from __future__ import annotations
@@ -160,6 +160,7 @@ def run(
 def facts(request: RolloutCreate, model: PublishedModel, prepared: Prepared) -> dict[str, object]:
     """What an answer says beside its arrays; JSON types."""
     return {
+        "by": request.by,
         "dt_s": model.spec.dt_s,
         "history": model.model.config.history,
         "candidates": len(prepared.controllers),

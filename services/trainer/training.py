@@ -70,6 +70,7 @@ OTHER_GRIPS = (
     "Other grips hold at times in the recording than those that this version learned from, so its error there is not "
     "measured: a version for each set of grips predicts it together (physworld.worldmodel.holding)."
 )
+DIVERGED = "The training diverged at step {}: the network is that of step {}, the best before."
 READING, PRIORS, TRAINING, FINE_TUNING, MEASURING, EXPORTING = (
     "reading the dataset", "fitting the priors", "training", "fine-tuning on the recording",
     "measuring on the held-out frames", "exporting as",
@@ -331,6 +332,8 @@ def _metrics(
     judged: bool,
 ) -> dict[str, Any]:
     notes = [] if judged else [OTHER_GRIPS]
+    if trained.diverged_at is not None:
+        notes.append(DIVERGED.format(trained.diverged_at, trained.best_step))
     return {
         "held_out": measured.table,
         "judged_on_recording": judged,
@@ -349,6 +352,7 @@ def _metrics(
             "best_step": trained.best_step,
             "steps": trained.steps,
             "steps_left_out": trained.steps_left_out,
+            "diverged_at_step": trained.diverged_at,
             "curve": trained.validation,
             "training_loss": trained.losses,
         },

@@ -16,7 +16,7 @@ from physworld_client.predictions import Planned, Predicted
 from physworld_client.types import Array, Job, Plan, Rollout
 from physworld_schemas.arrays import EncodedArray
 from physworld_schemas.plan import PlanConfig, PlanCreate, PlanLimits
-from physworld_schemas.rollout import Part, RolloutCreate, Start
+from physworld_schemas.rollout import Part, Predictor, RolloutCreate, Start
 
 ANSWER_S = 60.0
 """Seconds that the service may work on a rollout before it answers."""
@@ -42,6 +42,7 @@ class AsyncRollouts(AsyncListed):
         returns: Sequence[Part] = ("points",),
         every: int = 1,
         open_s: Sequence[Sequence[tuple[float, float]]] | None = None,
+        by: Predictor = "model",
         as_job: bool = False,
         timeout: float | None = None,
     ) -> Predicted:
@@ -58,6 +59,8 @@ class AsyncRollouts(AsyncListed):
             returns: "points" (measured points), "vertices" (the graph's).
             every: return each so many-th tick.
             open_s: of each grip of the scene, times at which it is open, (begin, end) [s] from 0; by default all hold.
+            by: "model", or "twin": the calibrated twin that the version learned from, always as a job and without
+                ``phi``.
             as_job: queue it, however small.
             timeout: seconds to wait for a job.
         """
@@ -71,6 +74,7 @@ class AsyncRollouts(AsyncListed):
             returns=list(returns),
             every=every,
             open_s=None if open_s is None else [list(spans) for spans in open_s],
+            by=by,
             mode="job" if as_job else "auto",
             times=None if times is None else np.asarray(times, dtype=np.float64).tolist(),
             dt_s=dt_s,

@@ -60,9 +60,10 @@ def create_rollout(
     settings: SettingsDep,
     principal: PrincipalDep,
 ) -> Response:
-    """Predict a batch of control paths: 200 with the arrays for a small one, 202 with a job for a large one."""
+    """Predict a batch of control paths: 200 with the arrays for a small one, 202 with a job for a large one, or for
+    one by the twin."""
     with database.reading() as session:
-        version = ready_version(registry.get_version(session, body.model, body.version))
+        version = _predicting(body, registry.get_version(session, body.model, body.version))
         scene = resources.get_scene(session, str(version.scene_id))
     shape = _shape(body, scene.controllers)
     asked = _encoded(body).model_copy(update={"version": version.version})
@@ -71,7 +72,7 @@ def create_rollout(
         {"points": scene.points, "vertices": version.config.vertices}[part] for part in set(body.returns)
     )
     small = shape[0] * ticks <= SYNC_STEPS and 3 * shape[0] * -(-ticks // body.every) * places <= SYNC_VALUES
-    if small and body.mode == "auto" and settings.inference_url:
+    if small and body.mode == "auto" and body.by == "model" and settings.inference_url:
         found = roll_out(settings.inference_url, database, principal.credential, asked)
         return idempotency.run(body, lambda session: answer_of(200, found))
     opening = _opening(asked, shape, ticks, version.version, stores)
@@ -105,7 +106,7 @@ def rollout_opening(
         made_of: what the arrays of the body were made of, kept among the job's settings.
     """
     with database.reading() as session:
-        version = ready_version(registry.get_version(session, body.model, body.version))
+        version = _predicting(body, registry.get_version(session, body.model, body.version))
         scene = resources.get_scene(session, str(version.scene_id))
     shape = _shape(body, scene.controllers)
     asked = _encoded(body).model_copy(update={"version": version.version})
@@ -141,6 +142,14 @@ def ready_version(version: ModelVersion) -> ModelVersion:
             f"version {version.version} of {version.name} is {version.state}; it cannot predict",
         )
     return version
+
+
+def _predicting(body: RolloutCreate, version: ModelVersion) -> ModelVersion:
+    """The version, if it can predict as is asked. Raises ApiProblem, 409 or 422."""
+    ready = ready_version(version)
+    if body.by == "twin" and ready.fit_id is None:
+        raise invalid("by", f"version {ready.version} of {ready.name} learned from no twin of this service")
+    return ready
 
 
 def invalid(field: str, message: str) -> ApiProblem:

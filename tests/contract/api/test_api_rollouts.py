@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import tracemalloc
 from collections.abc import Iterator
+from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from inference_serving import Served, serve_inference
@@ -50,6 +52,13 @@ def absurd(controllers: np.ndarray) -> np.ndarray:
     changed = controllers.copy()
     changed[2, 5, 0, 1] = 1e300
     return changed
+
+
+def arrays_of(client: httpx.Client, rollout: dict[str, Any]) -> dict[str, np.ndarray]:
+    """The arrays of a rollout that was a job."""
+    file = next(item for item in rollout["artifacts"] if item["name"] == "rollout.npz")
+    with np.load(io.BytesIO(client.get(f"/v1/artifacts/{file['sha256']}").content)) as npz:
+        return {name: npz[name] for name in npz.files}
 
 
 def _work(served: Served, ends: str = "done") -> None:
@@ -150,6 +159,56 @@ def test_a_large_rollout_is_a_job_whose_artifact_is_the_same_prediction(served: 
     model = tiny_model()[2]
     expected = model.skin.apply(model.rollout_batch(controllers[:2].astype(np.float32).astype(float)))
     assert points[:2] == pytest.approx(expected, abs=SINGLE_PRECISION_M)
+
+
+def test_the_twin_answers_the_same_request_as_a_job(served: Served) -> None:
+    _, twin, model = tiny_model()
+    controllers = paths(2)
+    with served.client() as client:
+        answer = client.post(
+            "/v1/rollouts", json=body(served, controllers, by="twin", returns=["points", "vertices"], every=3)
+        )
+        assert answer.status_code == 202, answer.text
+        _work(served)
+        made = client.get(answer.json()["links"]["rollout"]).json()
+        assert (made["state"], made["by"]) == ("ready", "twin")
+        assert [item["kind"] for item in made["lineage"]["inputs"]] == ["model", "scene", "fit"]
+        found = arrays_of(client, made)
+    times = model.spec.dt_s * np.arange(controllers.shape[1])
+    for number, path in enumerate(controllers.astype(np.float32).astype(float)):
+        nodes = twin.simulate_nodes(times, path, times)[::3]
+        assert found["points"][number] == pytest.approx(twin.track_nodes(nodes), abs=SINGLE_PRECISION_M)
+        vertices = twin.particles_at(nodes)[:, model.spec.particle_index]
+        assert found["vertices"][number] == pytest.approx(vertices, abs=SINGLE_PRECISION_M)
+    assert found["times"] == pytest.approx(times[::3])
+
+
+def test_the_twin_from_rest_and_stiffer_lies_still_and_then_bends_less(served: Served) -> None:
+    model = tiny_model()[2]
+    still = np.repeat(model.start_controllers[:1], 10, axis=0)
+
+    def sag(factor: float) -> np.ndarray:
+        with served.client() as client:
+            job = client.post(
+                "/v1/rollouts", json=body(served, still, by="twin", start="rest", stiffness_factor=factor)
+            ).json()
+            _work(served)
+            made = client.get(job["links"]["rollout"]).json()
+            points = arrays_of(client, made)["points"]
+        assert points.shape[:2] == (1, 10)
+        return np.abs(points[0] - points[0, 0]).max(axis=(1, 2))
+
+    soft, stiff = sag(1.0), sag(4.0)
+    assert soft[0] == 0.0
+    assert 0.0 < stiff[-1] < 0.8 * soft[-1]
+
+
+def test_the_twin_has_no_phi(served: Served) -> None:
+    phi = np.zeros((tiny_model()[2].spec.object_count, 2)).tolist()
+    with served.client() as client:
+        answer = client.post("/v1/rollouts", json=body(served, paths(1), by="twin", phi=phi))
+    assert answer.status_code == 422
+    assert "stiffness_factor" in answer.text
 
 
 def test_a_part_that_is_named_twice_is_returned_once(served: Served) -> None:

@@ -139,6 +139,28 @@ def test_a_loss_that_is_not_a_number_is_named_with_its_step(
     assert caught.value.step == 0
 
 
+def test_a_training_that_diverges_late_returns_the_best_network_before(
+    tracks: list[Track], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = dataclasses.replace(LEARNING, validation_every=5)
+    draw, drawn = WindowSampler.draw, []
+
+    def from_step_30(self, frames, count, generator):
+        batch = draw(self, frames, count, generator)
+        drawn.append(0)
+        return dataclasses.replace(batch, phi=batch.phi * float("nan")) if len(drawn) > 30 else batch
+
+    monkeypatch.setattr(WindowSampler, "draw", from_step_30)
+    found = train(tracks, graph(), SMALL, settings)
+    assert found.diverged_at == 30
+    assert 0 < found.best_step <= 30
+    assert found.best_error_m == min(error for _, error in found.validation) < found.prior_error_m
+    _, held_out = split_tracks(tracks, settings.validation_fraction, settings.seed)
+    assert training_module.open_loop_error(found.model, held_out) == pytest.approx(
+        found.best_error_m, rel=1e-6
+    )
+
+
 def test_a_step_whose_gradient_explodes_is_left_out(
     tracks: list[Track], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,6 +176,7 @@ def test_a_step_whose_gradient_explodes_is_left_out(
     losses: list[float] = []
     found = train(tracks, graph(), SMALL, SHORT, progress=lambda step, steps, loss: losses.append(loss))
     assert (undisturbed.steps_left_out, found.steps_left_out, found.steps) == (0, 3, 12)
+    assert found.diverged_at is None
     assert np.isfinite(losses).all()
     assert losses[0] == 1.0
     assert losses[6] == losses[4]

@@ -49,6 +49,9 @@ def rollout(
             "--open", metavar="GRIP:BEGIN,END", help="A grip, from 0, is open from BEGIN to END [s]."
         ),
     ] = None,
+    twin: Annotated[
+        bool, typer.Option(help="By the calibrated twin that the version learned from, not by its network.")
+    ] = False,
     timeout: Annotated[float | None, typer.Option(min=0, help="Seconds to wait for a job.")] = None,
     json: Json = False,
 ) -> None:
@@ -66,6 +69,7 @@ def rollout(
         returns=returns,
         every=every,
         open_s=open_times(opened or []),
+        by="twin" if twin else "model",
         timeout=timeout,
     )
     parts = {"points": found.points, "vertices": found.vertices}
