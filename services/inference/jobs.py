@@ -11,7 +11,7 @@ from typing import Any
 from physworld_schemas.base import Reference
 from physworld_schemas.plan import PlanCreate
 from physworld_schemas.rollout import RolloutCreate
-from physworld_services.inference import rollouts, twin_rollouts
+from physworld_services.inference import rollouts
 from physworld_services.inference.models import Models
 from physworld_storage import registry
 from physworld_storage.runs import RESULT
@@ -37,6 +37,8 @@ def rollout(context: TaskContext, stores: Stores) -> HandlerResult:
 
     made_of: list[dict[str, Any]] = []
     if asked.by == "twin":
+        from physworld_services.inference import twin_rollouts
+
         own = {"scene_id": version.scene_id, "fit_id": version.fit_id, "trace_id": version.trace_id}
         made_of = [item.model_dump(mode="json") for item in made_from(stores, own)]
         twin = twin_of(stores, str(version.fit_id), version.trace_id)
