@@ -37,7 +37,7 @@ class RolloutCreate(Request):
     second tick. ``dt_s``, where given, must be the model's. ``phi`` are log ratios of stiffness and
     density to the calibrated ones, (n, 2) or (B, n, 2), the fine-tuned ones without it; the factors come on top.
     ``by`` "twin": the calibrated twin that the version learned from is simulated instead of its network, always as a
-    job; it has no ``phi``.
+    job; it has no ``phi``. Without ``by`` the version's ``predictor`` answers, and its network where there is ``phi``.
     """
 
     model: ModelName = Field(description="Name of the model.", examples=["soft_beam"])
@@ -105,9 +105,10 @@ class RolloutCreate(Request):
     mode: Literal["auto", "job"] = Field(
         default="auto", description="Answer at once where it is small, or always as a job."
     )
-    by: Predictor = Field(
-        default="model",
-        description="Who predicts: the version's network, or the calibrated twin that it learned from (a job).",
+    by: Predictor | None = Field(
+        default=None,
+        description="Who predicts: the version's network, or the calibrated twin that it learned from (a job); empty: "
+        "the `predictor` of the version's metrics.",
     )
 
     @model_validator(mode="after")

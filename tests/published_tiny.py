@@ -84,13 +84,14 @@ def publish_tiny(
     changed: dict[str, Callable[[np.ndarray], np.ndarray]] | None = None,
     weights: bytes | None = None,
     hidden: int | None = None,
+    metrics: dict[str, Any] | None = None,
 ) -> tuple[str, int]:
     """Register scene, fit and model; the model's name and version.
 
     ``kind``: of the thing; ``dragged``: as of ``tiny_model``; ``acting``: an effect of the twin beside the model, with
     its strengths; ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more of its
     card; ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all; ``hidden``: a
-    measured point that the recording sees in its first frame only.
+    measured point that the recording sees in its first frame only; ``metrics``: of the version.
     """
     scene, twin, model = tiny_model(kind, dragged)
     if hidden is not None:
@@ -130,7 +131,7 @@ def publish_tiny(
             row.version,
             artifacts=[*files, manifest],
             sha256=manifest.sha256,
-            metrics={},
+            metrics=metrics or {},
             lineage=Lineage(),
         )
         return name, row.version

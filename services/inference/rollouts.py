@@ -160,7 +160,7 @@ def run(
 def facts(request: RolloutCreate, model: PublishedModel, prepared: Prepared) -> dict[str, object]:
     """What an answer says beside its arrays; JSON types."""
     return {
-        "by": request.by,
+        "by": request.by or "model",
         "dt_s": model.spec.dt_s,
         "history": model.model.config.history,
         "candidates": len(prepared.controllers),

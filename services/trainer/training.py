@@ -53,7 +53,7 @@ from physworld_schemas.model import ModelVersion, TrainingConfig
 from physworld_schemas.quality import quality_of
 from physworld_services.trainer.closed_loop import closed_loop
 from physworld_services.trainer.episodes import Episodes
-from physworld_services.trainer.measuring import Measured, json_safe, measure
+from physworld_services.trainer.measuring import Measured, json_safe, measure, predictor_of
 from physworld_services.trainer.publishing import MANIFEST_NAME, card_of, held_of, model_of, store_version
 from physworld_services.trainer.settings import translate
 from physworld_storage import registry, traces
@@ -71,6 +71,7 @@ OTHER_GRIPS = (
     "measured: a version for each set of grips predicts it together (physworld.worldmodel.holding)."
 )
 DIVERGED = "The training diverged at step {}: the network is that of step {}, the best before."
+TWIN_ANSWERS = "The twin is fast itself: it answers rollouts unless the network is asked for."
 READING, PRIORS, TRAINING, FINE_TUNING, MEASURING, EXPORTING = (
     "reading the dataset", "fitting the priors", "training", "fine-tuning on the recording",
     "measuring on the held-out frames", "exporting as",
@@ -334,12 +335,16 @@ def _metrics(
     notes = [] if judged else [OTHER_GRIPS]
     if trained.diverged_at is not None:
         notes.append(DIVERGED.format(trained.diverged_at, trained.best_step))
+    predictor = predictor_of(measured.steps_per_second)
+    if predictor == "twin":
+        notes.append(TWIN_ANSWERS)
     return {
         "held_out": measured.table,
         "judged_on_recording": judged,
         "notes": notes,
         "energy": measured.energy,
         "steps_per_second": measured.steps_per_second,
+        "predictor": predictor,
         "noise_floor_m": measured.table["noise_floor_m"],
         "seconds": seconds,
         "episodes": trained.episodes,

@@ -43,7 +43,7 @@ class Rollouts(Listed):
         returns: Sequence[Part] = ("points",),
         every: int = 1,
         open_s: Sequence[Sequence[tuple[float, float]]] | None = None,
-        by: Predictor = "model",
+        by: Predictor | None = None,
         as_job: bool = False,
         timeout: float | None = None,
     ) -> Predicted:
@@ -60,8 +60,8 @@ class Rollouts(Listed):
             returns: "points" (measured points), "vertices" (the graph's).
             every: return each so many-th tick.
             open_s: of each grip of the scene, times at which it is open, (begin, end) [s] from 0; by default all hold.
-            by: "model", or "twin": the calibrated twin that the version learned from, always as a job and without
-                ``phi``.
+            by: "model": the network, or "twin": the calibrated twin that the version learned from, always as a job and
+                without ``phi``; by default the ``predictor`` of the version's metrics.
             as_job: queue it, however small.
             timeout: seconds to wait for a job.
         """

@@ -21,6 +21,7 @@ from physworld_schemas.rollout import (
     MAX_TICKS,
     SYNC_STEPS,
     SYNC_VALUES,
+    Predictor,
     Rollout,
     RolloutCreate,
 )
@@ -63,16 +64,16 @@ def create_rollout(
     """Predict a batch of control paths: 200 with the arrays for a small one, 202 with a job for a large one, or for
     one by the twin."""
     with database.reading() as session:
-        version = _predicting(body, registry.get_version(session, body.model, body.version))
+        version = ready_version(registry.get_version(session, body.model, body.version))
         scene = resources.get_scene(session, str(version.scene_id))
     shape = _shape(body, scene.controllers)
-    asked = _encoded(body).model_copy(update={"version": version.version})
+    asked = _encoded(body).model_copy(update={"version": version.version, "by": _predictor(body, version)})
     ticks = _ticks(body, shape)
     places = sum(
         {"points": scene.points, "vertices": version.config.vertices}[part] for part in set(body.returns)
     )
     small = shape[0] * ticks <= SYNC_STEPS and 3 * shape[0] * -(-ticks // body.every) * places <= SYNC_VALUES
-    if small and body.mode == "auto" and body.by == "model" and settings.inference_url:
+    if small and body.mode == "auto" and asked.by == "model" and settings.inference_url:
         found = roll_out(settings.inference_url, database, principal.credential, asked)
         return idempotency.run(body, lambda session: answer_of(200, found))
     opening = _opening(asked, shape, ticks, version.version, stores)
@@ -106,10 +107,10 @@ def rollout_opening(
         made_of: what the arrays of the body were made of, kept among the job's settings.
     """
     with database.reading() as session:
-        version = _predicting(body, registry.get_version(session, body.model, body.version))
+        version = ready_version(registry.get_version(session, body.model, body.version))
         scene = resources.get_scene(session, str(version.scene_id))
     shape = _shape(body, scene.controllers)
-    asked = _encoded(body).model_copy(update={"version": version.version})
+    asked = _encoded(body).model_copy(update={"version": version.version, "by": _predictor(body, version)})
     return _opening(asked, shape, _ticks(body, shape), version.version, stores, made_of)
 
 
@@ -144,12 +145,16 @@ def ready_version(version: ModelVersion) -> ModelVersion:
     return version
 
 
-def _predicting(body: RolloutCreate, version: ModelVersion) -> ModelVersion:
-    """The version, if it can predict as is asked. Raises ApiProblem, 409 or 422."""
-    ready = ready_version(version)
-    if body.by == "twin" and ready.fit_id is None:
-        raise invalid("by", f"version {ready.version} of {ready.name} learned from no twin of this service")
-    return ready
+def _predictor(body: RolloutCreate, version: ModelVersion) -> Predictor:
+    """Who answers: as is asked, else as the version says. Raises ApiProblem, 422, for a twin that there is not."""
+    if body.by == "twin" and version.fit_id is None:
+        raise invalid(
+            "by", f"version {version.version} of {version.name} learned from no twin of this service"
+        )
+    if body.by is not None:
+        return body.by
+    prefers_twin = version.metrics.get("predictor") == "twin" and version.fit_id is not None
+    return "twin" if prefers_twin and body.phi is None else "model"
 
 
 def invalid(field: str, message: str) -> ApiProblem:

@@ -203,6 +203,25 @@ def test_the_twin_from_rest_and_stiffer_lies_still_and_then_bends_less(served: S
     assert 0.0 < stiff[-1] < 0.8 * soft[-1]
 
 
+def test_a_version_whose_twin_is_fast_is_answered_for_by_it_unless_the_network_is_asked(
+    served: Served,
+) -> None:
+    name, _ = publish_tiny(
+        served.database, served.stores.artifacts, name="tiny-rod", metrics={"predictor": "twin"}
+    )
+    asked = {**body(served, paths(1)), "model": name}
+    phi = np.zeros((tiny_model()[2].spec.object_count, 2)).tolist()
+    with served.client() as client:
+        unasked = client.post("/v1/rollouts", json=asked)
+        network = client.post("/v1/rollouts", json={**asked, "by": "model"})
+        turned = client.post("/v1/rollouts", json={**asked, "phi": phi})
+        _work(served)
+        made = client.get(unasked.json()["links"]["rollout"]).json()
+    assert (unasked.status_code, made["by"]) == (202, "twin")
+    assert (network.status_code, network.json()["by"]) == (200, "model")
+    assert (turned.status_code, turned.json()["by"]) == (200, "model")
+
+
 def test_the_twin_has_no_phi(served: Served) -> None:
     phi = np.zeros((tiny_model()[2].spec.object_count, 2)).tolist()
     with served.client() as client:

@@ -50,8 +50,12 @@ def rollout(
         ),
     ] = None,
     twin: Annotated[
-        bool, typer.Option(help="By the calibrated twin that the version learned from, not by its network.")
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--twin/--network",
+            help="By the calibrated twin that the version learned from, or by its network; default as its card says.",
+        ),
+    ] = None,
     timeout: Annotated[float | None, typer.Option(min=0, help="Seconds to wait for a job.")] = None,
     json: Json = False,
 ) -> None:
@@ -69,7 +73,7 @@ def rollout(
         returns=returns,
         every=every,
         open_s=open_times(opened or []),
-        by="twin" if twin else "model",
+        by=None if twin is None else "twin" if twin else "model",
         timeout=timeout,
     )
     parts = {"points": found.points, "vertices": found.vertices}
@@ -79,7 +83,7 @@ def rollout(
         return
     answer = found.rollout
     stdout.print(
-        f"{model} version {answer.version}: {answer.candidates} x {answer.ticks} ticks of {answer.dt_s:.4g} s in "
+        f"{model} version {answer.version}, by its {'twin' if answer.by == 'twin' else 'network'}: {answer.candidates} x {answer.ticks} ticks of {answer.dt_s:.4g} s in "
         f"{answer.seconds or 0.0:.2f} s, controls up to {answer.speed_m_s:.3g} m/s, written to {out}",
         markup=False,
         soft_wrap=True,
