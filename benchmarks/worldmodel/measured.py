@@ -106,8 +106,8 @@ def report_of(rows: list[dict[str, Any]]) -> Report:
         ),
         rows=table,
         notes=(
-            f"{sum(close)} of {len(rows)} networks err at most {CLOSE} times as much as their twins. What answers rollouts does "
-            f"so of {answered}: where it is the twin, by being it.",
+            f"{sum(close)} of {len(rows)} networks err at most {CLOSE} times as much as their twins. What answers "
+            f"rollouts does so of {answered}: where it is the twin, by being it.",
             "`model from twin`: between their predictions of the same frames. `read-out`: between the points that the "
             "twin's own vertices carry and the twin's points. `validation`: open loop on demonstrations kept aside. "
             "Ticks are 1/30 s, or near that; one candidate, one thread.",

@@ -82,8 +82,9 @@ def rollout(
         print_json(found.rollout.model_copy(update={"points": None, "vertices": None}))
         return
     answer = found.rollout
+    by = "twin" if answer.by == "twin" else "network"
     stdout.print(
-        f"{model} version {answer.version}, by its {'twin' if answer.by == 'twin' else 'network'}: {answer.candidates} x {answer.ticks} ticks of {answer.dt_s:.4g} s in "
+        f"{model} version {answer.version}, by its {by}: {answer.candidates} x {answer.ticks} ticks of {answer.dt_s:.4g} s in "
         f"{answer.seconds or 0.0:.2f} s, controls up to {answer.speed_m_s:.3g} m/s, written to {out}",
         markup=False,
         soft_wrap=True,
