@@ -85,7 +85,8 @@ def rollout(
     by = "twin" if answer.by == "twin" else "network"
     stdout.print(
         f"{model} version {answer.version}, by its {by}: {answer.candidates} x {answer.ticks} ticks of "
-        f"{answer.dt_s:.4g} s in {answer.seconds or 0.0:.2f} s, controls up to {answer.speed_m_s:.3g} m/s, written to {out}",
+        f"{answer.dt_s:.4g} s in {answer.seconds or 0.0:.2f} s, controls up to {answer.speed_m_s:.3g} m/s, "
+        f"written to {out}",
         markup=False,
         soft_wrap=True,
     )
