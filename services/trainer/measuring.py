@@ -23,7 +23,7 @@ from physworld.worldmodel.scene_view import SceneView
 
 SPEED_REPEATS = 3
 RUNS = SPEED_REPEATS + 3
-TWIN_SHARE = 0.1  # of the network's speed, from which on the twin answers
+TWIN_SHARE = 0.05  # of the network's speed, from which on the twin answers
 """Parts of a measurement: timed rollouts, the calibrated one, the table, the energy."""
 
 

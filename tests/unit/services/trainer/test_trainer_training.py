@@ -314,7 +314,7 @@ def test_numbers_that_json_lacks_become_null() -> None:
     assert json_safe(value) == {"a": [None, 3], "b": [None, True, None, "x"]}
 
 
-def test_a_twin_answers_rollouts_where_it_is_not_ten_times_slower_than_its_network() -> None:
+def test_a_twin_answers_rollouts_where_it_has_a_twentieth_of_the_speed_of_its_network() -> None:
     assert predictor_of({"twin": 25.0, "world_model": 4500.0}) == "model"
     assert predictor_of({"twin": 3000.0, "world_model": 3500.0}) == "twin"
 
