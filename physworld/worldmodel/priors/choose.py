@@ -3,13 +3,14 @@
 Every prior that can be made of the episodes is rolled out alone over whole held-out ones, the modal one in world axes
 and in the grip's frame; the training takes the one that errs least, and the card says what each erred
 (``validation.priors_m``). The frame is for turns of the grips that validation episodes may not show: the modal prior in
-it is taken unless another one is clearly better.
+it is taken unless the one in world axes is clearly better.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,7 +26,6 @@ from physworld.worldmodel.priors.prior_step import framed_prior, prior_step
 from physworld.worldmodel.rollout import mean_error, unroll_tracks
 
 MODAL, CHAIN, NONE, TURNED = "modal", "chain", "none", "modal_in_grip_frame"
-IN_FRAME = frozenset({TURNED})
 CLEARLY = 0.95  # times the error in the grip's frame: what world axes must stay below to be taken
 Prior = ModalPrior | ChainPrior | InertialPrior
 
@@ -63,23 +63,24 @@ def fit_priors(
         framed = spec.frame is not None and frame != "world"
         if frame != "grip" or not framed:
             found[MODAL] = fit_prior(positions, phis, *sizes)
-        if framed and CHAIN not in found:
+        if framed:
             found[TURNED] = fit_prior(positions, phis, *sizes, spec.frame)
     return found
 
 
 def spec_for(name: str, spec: GraphSpec, frame: str = "auto") -> GraphSpec:
     """The graph for the prior ``name``: with its grip's frame, or without. The network alone has it but for "world"."""
-    framed = name in IN_FRAME or (name == NONE and frame != "world")
+    framed = name == TURNED or (name == NONE and frame != "world")
     return spec if framed else replace(spec, frame=None)
 
 
 def choose(errors: dict[str, float]) -> str:
-    """The prior with the least error; one in the grip's frame also where another is not clearly better."""
-    best = min(errors, key=errors.__getitem__)
-    for name in IN_FRAME & set(errors):
-        if errors[best] > CLEARLY * errors[name]:
-            return name
+    """The prior with the least error; the modal one in the grip's frame also where that in world axes is not clearly
+    better. One that leaves the numbers is taken only where all do."""
+    known = {name: error if np.isfinite(error) else np.inf for name, error in errors.items()}
+    best = min(known, key=known.__getitem__)
+    if best == MODAL and known[MODAL] > CLEARLY * known.get(TURNED, np.inf):
+        return TURNED
     return best
 
 

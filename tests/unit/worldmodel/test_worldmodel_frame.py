@@ -143,6 +143,9 @@ def test_the_prior_in_the_frame_follows_a_turned_world_where_world_axes_do_not()
 def test_the_frame_is_taken_unless_another_prior_is_clearly_better() -> None:
     assert choose({"modal": 1.0, TURNED: 1.02}) == TURNED
     assert choose({"modal": 1.0, TURNED: 1.2}) == "modal"
+    assert choose({"chain": 1.0, "modal": 1.1, TURNED: 1.02}) == "chain"
+    assert choose({"chain": 2.0, "modal": 1.0, TURNED: 0.9}) == TURNED
+    assert choose({"modal": float("nan"), TURNED: 2.0}) == TURNED
     assert choose({"modal": 1.0, "chain": 0.5}) == "chain"
 
 
