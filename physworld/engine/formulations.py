@@ -60,12 +60,14 @@ class Formulation(ABC):
         name: in archives, on the wire and on the command line.
         dimensions: of the bodies that it holds.
         on_particles: its carriers are the particles, not the nodes.
+        fast: it runs hundreds of frames a second or more on one thread, so that a network beside it saves little time.
         abilities: what may be asked of its runs.
     """
 
     name: ClassVar[str]
     dimensions: ClassVar[frozenset[int]]
     on_particles: ClassVar[bool]
+    fast: ClassVar[bool] = False
     abilities: ClassVar[frozenset[Ability]]
 
     @property
@@ -228,6 +230,7 @@ class RodForm(Formulation):
     name = "discrete_rod"
     dimensions = frozenset({1})
     on_particles = False
+    fast = True
     abilities = frozenset()
 
     def refuse(self, dimension: int, plasticity: Plasticity | None, asked: str) -> None:

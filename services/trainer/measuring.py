@@ -23,7 +23,6 @@ from physworld.worldmodel.scene_view import SceneView
 
 SPEED_REPEATS = 3
 RUNS = SPEED_REPEATS + 3
-TWIN_SHARE = 0.05  # of the network's speed, from which on the twin answers
 """Parts of a measurement: timed rollouts, the calibrated one, the table, the energy."""
 
 
@@ -97,15 +96,6 @@ def measure(
         },
         energy=still_energy(published, controllers),
     )
-
-
-def predictor_of(steps_per_second: dict[str, float]) -> str:
-    """Who answers rollouts of a version where nobody is asked for: "twin" where it has ``TWIN_SHARE`` of the network's
-    speed or more, else "model".
-
-    The network learns from the twin and errs beside it; it is there because twins are slow.
-    """
-    return "twin" if steps_per_second["twin"] >= TWIN_SHARE * steps_per_second["world_model"] else "model"
 
 
 def json_safe(value: Any) -> Any:

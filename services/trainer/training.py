@@ -53,7 +53,7 @@ from physworld_schemas.model import ModelVersion, TrainingConfig
 from physworld_schemas.quality import quality_of
 from physworld_services.trainer.closed_loop import closed_loop
 from physworld_services.trainer.episodes import Episodes
-from physworld_services.trainer.measuring import Measured, json_safe, measure, predictor_of
+from physworld_services.trainer.measuring import Measured, json_safe, measure
 from physworld_services.trainer.publishing import MANIFEST_NAME, card_of, held_of, model_of, store_version
 from physworld_services.trainer.settings import translate
 from physworld_storage import registry, traces
@@ -152,6 +152,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     metrics = json_safe(
         _metrics(view, trained, tuned, measured, seconds, view.as_recorded or held is not None)
     )
+    if twin.form.fast:
+        metrics["predictor"] = "twin"
+        metrics["notes"].append(TWIN_ANSWERS)
     metrics["fine_tuning"]["strengths"] = json_safe(episodes.tuned(tuned.strengths))
     metrics["closed_loop"] = json_safe(closed_loop(stores, payload, metrics, architecture))
     dataset = episodes.sealed()
@@ -335,16 +338,13 @@ def _metrics(
     notes = [] if judged else [OTHER_GRIPS]
     if trained.diverged_at is not None:
         notes.append(DIVERGED.format(trained.diverged_at, trained.best_step))
-    predictor = predictor_of(measured.steps_per_second)
-    if predictor == "twin":
-        notes.append(TWIN_ANSWERS)
     return {
         "held_out": measured.table,
         "judged_on_recording": judged,
         "notes": notes,
         "energy": measured.energy,
         "steps_per_second": measured.steps_per_second,
-        "predictor": predictor,
+        "predictor": "model",
         "noise_floor_m": measured.table["noise_floor_m"],
         "seconds": seconds,
         "episodes": trained.episodes,

@@ -216,6 +216,7 @@ def test_a_recording_in_which_a_grip_lets_go_gives_one_version_that_follows_it(
     assert version.state == "ready", version.message
     table = version.metrics["held_out"]["track_m"]
     assert version.metrics["judged_on_recording"] and version.metrics["notes"] == []
+    assert version.metrics["predictor"] == "model"
     assert table["world_model"] == table["world_model_finetuned"] > 0.0
 
     for item in version.artifacts:

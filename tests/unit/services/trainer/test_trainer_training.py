@@ -32,7 +32,7 @@ from physworld_schemas.model import ModelVersion, TrainingConfig, TrainingCreate
 from physworld_schemas.quality import quality_of
 from physworld_schemas.signing import ManifestSignature
 from physworld_services.trainer import training
-from physworld_services.trainer.measuring import json_safe, predictor_of
+from physworld_services.trainer.measuring import json_safe
 from physworld_services.trainer.settings import translate
 from physworld_storage import registry, resources, signing
 from physworld_storage.database import open_database
@@ -312,11 +312,6 @@ def test_settings_of_the_wire_reach_the_library(monkeypatch: pytest.MonkeyPatch)
 def test_numbers_that_json_lacks_become_null() -> None:
     value = {"a": [np.float64("inf"), np.int64(3)], "b": (float("nan"), True, None, "x")}
     assert json_safe(value) == {"a": [None, 3], "b": [None, True, None, "x"]}
-
-
-def test_a_twin_answers_rollouts_where_it_has_a_twentieth_of_the_speed_of_its_network() -> None:
-    assert predictor_of({"twin": 25.0, "world_model": 4500.0}) == "model"
-    assert predictor_of({"twin": 3000.0, "world_model": 3500.0}) == "twin"
 
 
 def test_a_rollout_that_left_the_numbers_is_published_as_absent(monkeypatch: pytest.MonkeyPatch) -> None:
