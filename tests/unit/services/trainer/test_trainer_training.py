@@ -19,6 +19,7 @@ from pydantic import SecretStr
 from safetensors.numpy import load
 from tiny_scene import register, tiny_scene
 
+from physworld.engine.formulations import FORMULATIONS
 from physworld.scene import Ground
 from physworld.twin.build import build_twin
 from physworld.worldmodel import PublishedModel
@@ -246,6 +247,17 @@ def test_the_metrics_have_every_row_of_the_table(runtime: Runtime, dataset_id: s
     assert version.quality.verdict in {"passed", "failed"}
     card = json.loads(_files(runtime, version)["card.json"])
     assert card["quality"] == version.quality.model_dump(mode="json")
+
+
+def test_where_the_form_of_the_twin_is_fast_the_version_says_that_the_twin_answers(
+    runtime: Runtime, dataset_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = _train(runtime, dataset_id)[1].metrics
+    monkeypatch.setattr(FORMULATIONS["total_lagrangian"], "fast", True)
+    fast = _train(runtime, dataset_id)[1].metrics
+    assert (plain["predictor"], plain["notes"]) == ("model", [])
+    assert (fast["predictor"], fast["notes"]) == ("twin", [training.TWIN_ANSWERS])
+    assert FORMULATIONS["discrete_rod"].fast
 
 
 def test_the_same_inputs_give_the_same_weights(runtime: Runtime, dataset_id: str) -> None:
