@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from safetensors.numpy import save as save_tensors
-from tiny_scene import register, tiny_scene, tiny_thing
+from tiny_scene import between_two_grips, register, tiny_scene, tiny_thing
 
 from physworld.demonstrate import DemonstrationConfig, StrengthRange, derived_seed, make_episode
 from physworld.effects.registry import effect
@@ -19,6 +19,7 @@ from physworld.scene import Scene
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 from physworld.worldmodel.dataset import read_track
+from physworld.worldmodel.holding.spans import train_held
 from physworld.worldmodel.model.conditioning import Conditioning
 from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.model.properties import PROPERTIES
@@ -29,6 +30,7 @@ from physworld_schemas.base import Lineage
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.model import TrainingConfig as WireConfig
 from physworld_services.trainer.episodes import column_of
+from physworld_services.trainer.publishing import held_of
 from physworld_storage import registry
 from physworld_storage.artifacts import ArtifactStore
 from physworld_storage.database import Database
@@ -47,8 +49,11 @@ DRAG = StrengthRange("air_drag_linear", "rate_per_s", 2.0, 0.5, 3.5)
 def tiny_model(kind: str = "beam", dragged: bool = False) -> tuple[Scene, Twin, PublishedModel]:
     """The scene, its twin with prior parameters, and a model that learned from the twin: a bar's, or a thing's.
 
-    ``dragged``: the twin has ``DRAG``, and its demonstrations vary it.
+    ``kind``: "between two grips" is a bar of which one of them may let go; ``dragged``: the twin has ``DRAG``, and its
+    demonstrations vary it.
     """
+    if kind == "between two grips":
+        return _between()
     scene = tiny_scene(FRAMES) if kind == "beam" else tiny_thing(kind, FRAMES)
     twin = build_twin(scene, 60)
     twin = twin.with_parameters(youngs_modulus_pa=3e4) if kind == "beam" else twin
@@ -69,6 +74,22 @@ def tiny_model(kind: str = "beam", dragged: bool = False) -> tuple[Scene, Twin, 
     model = train(tracks, view.spec, SMALL, training, columns=columns).model
     phi, stands = np.zeros((view.spec.object_count, 2)), {column.name: 0.0} if dragged else {}
     return scene, twin, view.published(model.at_strengths(stands), phi, phi, Conditioning.of(model, stands))
+
+
+def _between() -> tuple[Scene, Twin, PublishedModel]:
+    """A bar between two grips, with models for both of them and for the first alone."""
+    scene = between_two_grips(FRAMES)
+    twin = build_twin(scene, 60).with_parameters(youngs_modulus_pa=3e4)
+    settings = DemonstrationConfig(frames=3 * FRAMES, regrasp_share=1.0)
+    episodes = [make_episode(scene, twin, settings, derived_seed(0, index))[0] for index in range(EPISODES)]
+    sets = ((0, 1), (0,))
+    views = {grips: view_scene(scene, twin, SMALL, None if len(grips) == 2 else grips) for grips in sets}
+    training = TrainingConfig(steps=2, batch_size=2, look_ahead=2)
+    specs = {grips: view.spec for grips, view in views.items()}
+    models = train_held(episodes, specs, 2, SMALL, training)
+    phi = np.zeros((views[0, 1].spec.object_count, 2))
+    whole, alone = (views[grips].published(models[grips].model, phi, phi) for grips in sets)
+    return scene, twin, replace(whole, others=(alone,))
 
 
 def publish_tiny(
@@ -112,13 +133,16 @@ def publish_tiny(
         assert lease is not None
         result = {"parameters": {}, "metrics": {}, "artifacts": [file.model_dump()]}
         assert leases.complete(session, lease, result, None)
-    text = json.dumps({"architecture": model.facts()} | (card or {})).encode()
+    told = {"architecture": model.facts(), "held": held_of(model.others)}
+    text = json.dumps(told | (card or {})).encode()
     tensors = {part: values for part, values in model.to_tensors().items() if part != lacking}
     tensors |= {part: np.ascontiguousarray(change(tensors[part])) for part, change in (changed or {}).items()}
     files = [
         artifacts.put_bytes(weights or save_tensors(tensors, {}), "model.safetensors"),
         artifacts.put_bytes(text, "card.json", "application/json"),
     ]
+    for part, other in zip(told["held"], model.others, strict=True):
+        files.append(artifacts.put_bytes(save_tensors(other.to_tensors(), {}), part["file"]))
     config = WireConfig(hidden=16, message_passing_steps=2, history=2, vertices=20)
     with database.session() as session:
         row = registry.allot_version(

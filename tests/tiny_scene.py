@@ -52,6 +52,19 @@ def tiny_scene(frames: int = FRAMES) -> Scene:
     )
 
 
+def between_two_grips(frames: int = FRAMES) -> Scene:
+    """The bar of :func:`tiny_scene` with a grip at either end; both move alike."""
+    bar = tiny_scene(frames)
+    half = SIDE_M / 2
+    far = Grip(
+        controllers=(4, 5, 6, 7),
+        region_min_m=np.array([LENGTH_M - 0.02, -half, -half]),
+        region_max_m=np.array([LENGTH_M, half, half]),
+    )
+    there = bar.controllers + np.array([LENGTH_M, 0.0, 0.0])
+    return replace(bar, controllers=np.concatenate([bar.controllers, there], axis=1), grips=(*bar.grips, far))
+
+
 def tiny_thing(kind: str, frames: int = FRAMES) -> Scene:
     """As :func:`tiny_scene`, of another kind: a "rope" of the same length, or a "sheet" as long and half as wide."""
     bar = tiny_scene(frames)

@@ -2,20 +2,45 @@
 
 It is the rollout of ``rollout.rollout`` cut into single steps: positions are counted from the same origin in the same
 precision, so that a session and a rollout under the same controllers agree to the last bit.
+
+A version that was published with models for other sets of grips can let go and take hold again, as in
+``physworld.worldmodel.holding.rollout``. The controllers of a grip that was opened go along with the material that it
+held; it closes where they are.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from physworld.arrays import Array
 from physworld.worldmodel.dataset import graph_origin
 from physworld.worldmodel.errors import GraphInvalid
+from physworld.worldmodel.holding.spans import Grips, every_grip
+from physworld.worldmodel.holding.taking import taken_hold, vertices_near
 from physworld.worldmodel.published import PublishedModel
 
 
+@dataclass(frozen=True)
+class _Opened:
+    """A grip that let go: when; its controllers (k,), and where they were then [m], (k, 3); vertices (m,) beside it."""
+
+    tick: int
+    own: Array
+    hand: Array
+    near: Array
+
+
 class LiveRollout:
-    """The state of one session: the last h + 1 frames of all vertices, and where the controllers are."""
+    """The state of one session: the last h + 1 frames of all vertices, and where the controllers are.
+
+    Attributes:
+        own: grips that hold at the start, those of the model itself.
+        holding: grips that hold now.
+        tick: steps since the start.
+    """
 
     def __init__(
         self,
@@ -36,7 +61,9 @@ class LiveRollout:
         Raises:
             GraphInvalid: other shapes than these.
         """
-        self._published, spec = published, published.spec
+        spec = published.spec
+        self.own: Grips = _grips_of(published)
+        self._models = {_grips_of(one): one for one in (published, *published.others)}
         self._phi = published.phi if phi is None else np.asarray(phi, dtype=np.float64)
         self._first = np.array(published.start_history if history is None else history, dtype=np.float64)
         driven = published.start_controllers if controllers is None else controllers
@@ -49,16 +76,28 @@ class LiveRollout:
         self.reset()
 
     def reset(self) -> None:
-        """Back to the start."""
-        self.tick = 0
-        self.controllers = self._first_controllers[-1].copy()
-        driven = self._first_controllers[:, self._published.spec.control_index] - self._origin
-        self._window = np.concatenate([self._first - self._origin, driven], axis=1).astype(np.float32)
+        """Back to the start, where the grips of the model itself hold."""
+        self.tick, self.holding = 0, self.own
+        self._opened: dict[int, _Opened] = {}
+        self._path = (self._first - self._origin).astype(np.float32)
+        self._driven = self._first_controllers.copy()
+
+    @property
+    def controllers(self) -> Array:
+        """All controllers now [m], (K, 3)."""
+        places: Array = self._driven[-1]
+        return places
+
+    @property
+    def sets(self) -> list[Grips]:
+        """The sets of grips that can hold."""
+        return sorted(self._models)
 
     @property
     def vertices(self) -> Array:
         """Object vertices now [m], (n, 3)."""
-        return self._window[-1, : self._published.spec.object_count].astype(np.float64) + self._origin
+        places: Array = self._path[-1].astype(np.float64) + self._origin
+        return places
 
     def set_phi(self, phi: Array) -> None:
         """Give the body other properties from the next step on: logarithms of property ratios (n, 2).
@@ -71,11 +110,30 @@ class LiveRollout:
         self._phi = given
 
     def set_model(self, published: PublishedModel) -> None:
-        """From the next step on the same network at other strengths (:meth:`PublishedModel.at_strengths`)."""
-        self._published = published
+        """From the next step on the same network at other strengths (:meth:`PublishedModel.at_strengths`); those of
+        other sets of grips stay as they are."""
+        self._models[self.own] = published
+
+    def hold(self, grips: Sequence[int]) -> None:
+        """From the next step on exactly these grips hold, by their numbers.
+
+        Raises GraphInvalid where there is no model for them; nothing has changed then.
+        """
+        wanted = tuple(sorted({*grips}))
+        if wanted not in self._models:
+            known = ", ".join(str(list(one)) for one in self.sets)
+            raise GraphInvalid(f"grips {list(wanted)} are to hold; there are world models of {known}")
+        opened = {grip: since for grip, since in self._opened.items() if grip not in wanted}
+        model = self._models[self.own]
+        for grip in sorted(set(self.holding) - set(wanted)):
+            own = np.array(model.grips[grip])
+            near = vertices_near(model.spec, self._first[0], self._first_controllers[0, own])
+            opened[grip] = _Opened(self.tick, own, self.controllers[own], near)
+        self._opened, self.holding = opened, wanted
 
     def step(self, controllers: Array) -> Array:
-        """Move all controllers to (K, 3) [m] within one tick; the object vertices then, (n, 3) [m].
+        """Move all controllers to (K, 3) [m] within one tick, but those of grips that were opened, which go along with
+        the material; the object vertices then, (n, 3) [m].
 
         Raises GraphInvalid for another shape or values that are not finite; nothing has moved then.
         """
@@ -85,9 +143,25 @@ class LiveRollout:
                 f"controllers of shape {places.shape} with {int(np.isfinite(places).sum())} finite values, "
                 f"not {self.controllers.shape}"
             )
-        spec, n = self._published.spec, self._published.spec.object_count
-        following = (places[spec.control_index] - self._origin).astype(np.float32)
-        driven = np.concatenate([self._window[:, n:], following[None]])
-        path = self._published.engine.run(self._window[:, :n], driven, self._phi)
-        self._window, self.controllers, self.tick = path[1:], places, self.tick + 1
+        model = self._models[self.holding]
+        self._driven = np.concatenate([self._driven, places[None]])
+        driven = (self._driven[:, model.spec.control_index] - self._origin).astype(np.float32)
+        self._path = model.engine.run(self._path, driven, self._phi)[1:, : model.spec.object_count]
+        self._driven, self.tick = self._driven[1:], self.tick + 1
+        self._carry()
         return self.vertices
+
+    def _carry(self) -> None:
+        """Take the controllers of opened grips along with the material, in all frames of the window since then."""
+        for grip in self._opened.values():
+            frames = min(self.tick - grip.tick, len(self._path))
+            path = self._path[-frames:, grip.near].astype(np.float64) + self._origin
+            path = np.concatenate([self._first[:1, grip.near], path])
+            if np.isfinite(path).all():
+                hand = np.stack([self._first_controllers[0, grip.own], *[grip.hand] * frames])
+                self._driven[-frames:, grip.own] = taken_hold(path, hand, 0)
+
+
+def _grips_of(published: PublishedModel) -> Grips:
+    """The grips that hold in a version."""
+    return every_grip(len(published.grips)) if published.holding is None else published.holding

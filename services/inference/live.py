@@ -4,7 +4,8 @@
 frames (``session``), ``frames`` of them a tick, interpolated; ``part=vertices`` for the graph's vertices. The client
 sends binary control messages, and as JSON text ``{"type": "reset"}`` and ``{"type": "factors", "factors": {NAME: x}}``,
 properties of the body relative to the model's, beside which ``"strengths": {NAME: x}`` may stand, strengths of effects
-in their units. Velocities last ``HOLD_S``: a client that falls silent stops its grips.
+in their units. Velocities last ``HOLD_S``: a client that falls silent stops its grips. ``{"type": "open", "grips":
+[1]}`` opens these grips and closes the others, where the version has a model for those that hold then.
 
 With ``{"type": "twin", "on": true}`` the calibrated twin is run beside the model, on the same grips
 (``physworld_services.inference.companion``): its frames bear the flag 2; texts of the type ``twin`` say how it does.
@@ -203,6 +204,11 @@ class _Connection:
             self._factors = dict(message["factors"])
             if self._twin is not None:
                 self._twin.change(self._factors, self._strengths)
+        elif kind == "open":
+            self._session.open_grips(list(message["grips"]))
+            if message["grips"] and self._twin_task is not None:
+                await self._let_twin_go()
+                self._say({"state": "refused", "reason": "a twin that is run live cannot let go"})
         elif kind == "twin":
             await self._let_twin_go()
             if message["on"] is True:

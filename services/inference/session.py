@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,12 +84,13 @@ class LiveSession:
         self._model = model
         self._skin = None if vertices else model.skin
         start = model.start_controllers[-1]
-        self.groups = grip_groups(model.spec, start)
+        self.groups = tuple(map(np.array, model.grips)) or grip_groups(model.spec, start)
         size = float(np.ptp(model.spec.rest_vertices, axis=0).max())
         self.speed_m_s, self.reach_m = SPEED_PER_SIZE * size, REACH_PER_SIZE * size
         self._start, self._flags = start, 0
         self._strengths = () if model.strengths is None else model.strengths.columns
         self._rollout = LiveRollout(model)
+        self._wanted = self._rollout.holding
         self._before = self._now = self._places()
 
     def describe(self) -> dict[str, Any]:
@@ -99,6 +100,7 @@ class LiveSession:
             "points": len(self._now) - len(self._start),
             "controllers": self._start.tolist(),
             "grips": [group.tolist() for group in self.groups],
+            "holding": [list(grips) for grips in self._rollout.sets],
             "speed_m_s": self.speed_m_s,
             "reach_m": self.reach_m,
             "factors": [column.name for column in self._model.columns],
@@ -156,18 +158,35 @@ class LiveSession:
         except ValueError as error:
             raise ControlRefused(str(error)) from error
 
+    def open_grips(self, grips: Sequence[Any]) -> None:
+        """From the next tick on these grips are open, by their numbers from 0, and the others hold.
+
+        An open grip goes along with the material that it held, and closes where it is. Raises ControlRefused.
+        """
+        count = len(self.groups)
+        if any(isinstance(grip, bool) or grip not in range(count) for grip in grips):
+            raise ControlRefused(f"grips {list(grips)} are to open; the session has {count}, from 0 on")
+        wanted = tuple(grip for grip in self._rollout.own if grip not in grips)
+        if wanted not in self._rollout.sets:
+            known = ", ".join(str(list(one)) for one in self._rollout.sets)
+            raise ControlRefused(f"grips {list(wanted)} would hold; the version has models of {known}")
+        self._wanted = wanted
+
     def reset(self) -> None:
-        """Back to the start."""
+        """Back to the start, where no grip has been opened."""
         self._rollout.reset()
+        self._wanted = self._rollout.holding
         self._before = self._now = self._places()
 
     def tick(self, velocity: Array) -> None:
         """One step of the model under velocities (K, 3) [m/s]; a prediction that left the numbers is set back."""
-        wanted = self._rollout.controllers + self.dt_s * velocity
-        offset = wanted - self._start
+        self._rollout.hold(self._wanted)
+        before = self._rollout.controllers - self._start
+        offset = before + self.dt_s * velocity
         for group in self.groups:  # a grip stays rigid where it meets the end of its reach
             middle = offset[group].mean(axis=0)
-            offset[group] += np.clip(middle, -self.reach_m, self.reach_m) - middle
+            reach = np.maximum(self.reach_m, np.abs(before[group].mean(axis=0)))  # it may have closed beyond
+            offset[group] += np.clip(middle, -reach, reach) - middle
         self._rollout.step(self._start + offset)
         self._before, self._now = self._now, self._places()
         if not (np.abs(self._now) < 1e3).all():

@@ -177,6 +177,26 @@ def test_a_strength_of_an_effect_has_a_slider_over_what_the_training_covered(
     expect(page.locator("[data-note]")).to_be_hidden()
 
 
+def test_a_box_opens_a_grip_and_start_again_closes_it(served: Served, page: Page) -> None:
+    bar = {"name": "tiny-between", "kind": "between two grips"}
+    model, version = publish_tiny(served.database, served.stores.artifacts, **bar)
+    enter(dataclasses.replace(served, model=model, version=version), page)
+    far, first = (page.get_by_label(f"Grip {number} holds") for number in (2, 1))
+    expect(far).to_be_checked()
+    expect(first).to_be_disabled()  # there is no model for the second grip alone
+    high = page.evaluate("() => window.playgrounds[0].places[1].z")
+    far.uncheck()
+    until(page, lambda: bool(page.evaluate("() => window.playgrounds[0].places[1].z") < high - 3e-3))
+    page.click("[data-reset]")
+    expect(far).to_be_checked()
+    until(page, lambda: bool(abs(page.evaluate("() => window.playgrounds[0].places[1].z") - high) < 1e-6))
+    page.get_by_label("Twin, live").check()
+    expect(page.locator("[data-twin]")).to_contain_text("real time")
+    far.uncheck()
+    expect(page.locator("[data-twin]")).to_contain_text("a twin that is run live cannot let go")
+    expect(page.locator("[data-note]")).to_be_hidden()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", WIDTHS)
 def test_axe_finds_nothing_beside_a_live_session(

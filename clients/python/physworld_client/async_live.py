@@ -10,7 +10,7 @@ A session ends with its block, or where the service ends it.
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Iterable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Literal
 
@@ -70,6 +70,17 @@ class AsyncLiveSession:
     async def reset(self) -> None:
         """Puts the body back to its start; velocities that were set go on for their 0.3 s."""
         await self._send(live_frames.RESET)
+
+    async def open_grips(self, grips: Iterable[int]) -> None:
+        """Opens these grips from the next tick on, by their numbers from 0, and closes the others; a reset closes all.
+
+        An open grip goes along with the material that it held, and closes where it is. The grips that hold must be
+        one of the sets in ``start.holding``; the service ends the session where they are not.
+
+        Raises:
+            LiveSessionEnded: the session is over.
+        """
+        await self._send(live_frames.write_open(grips))
 
     async def set_factors(
         self, factors: Mapping[str, float], strengths: Mapping[str, float] | None = None

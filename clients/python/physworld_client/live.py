@@ -11,7 +11,7 @@ A session ends with its block, or where the service ends it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import Literal
 
@@ -69,6 +69,17 @@ class LiveSession:
     def reset(self) -> None:
         """Puts the body back to its start; velocities that were set go on for their 0.3 s."""
         self._send(live_frames.RESET)
+
+    def open_grips(self, grips: Iterable[int]) -> None:
+        """Opens these grips from the next tick on, by their numbers from 0, and closes the others; a reset closes all.
+
+        An open grip goes along with the material that it held, and closes where it is. The grips that hold must be
+        one of the sets in ``start.holding``; the service ends the session where they are not.
+
+        Raises:
+            LiveSessionEnded: the session is over.
+        """
+        self._send(live_frames.write_open(grips))
 
     def set_factors(self, factors: Mapping[str, float], strengths: Mapping[str, float] | None = None) -> None:
         """Gives the body other properties from the next tick on, also after a reset.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from urllib.parse import urlencode
 
@@ -58,6 +58,7 @@ class LiveStart:
         grips: which control points move as one body, G groups of numbers.
         speed_m_s: speeds beyond are cut.
         reach_m: a grip stops that far from its start, along each axis.
+        holding: the sets of grips that can hold, by their numbers; more than one where grips can let go.
         factors: properties that can be changed; none where the service is older than they are.
         strengths: of effects, those that the model was trained over.
     """
@@ -68,6 +69,7 @@ class LiveStart:
     grips: tuple[tuple[int, ...], ...]
     speed_m_s: float
     reach_m: float
+    holding: tuple[tuple[int, ...], ...] = ()
     factors: tuple[str, ...] = ()
     strengths: tuple[LiveStrength, ...] = ()
 
@@ -125,6 +127,11 @@ def write_factors(factors: Mapping[str, float], strengths: Mapping[str, float]) 
     return json.dumps(message)
 
 
+def write_open(grips: Iterable[int]) -> str:
+    """Grips that are to be open, by their numbers; the others hold."""
+    return json.dumps({"type": "open", "grips": [int(grip) for grip in grips]})
+
+
 def read_start(message: bytes | str) -> LiveStart:
     """The first message. Raises PhysWorldError where it is another one."""
     try:
@@ -136,6 +143,7 @@ def read_start(message: bytes | str) -> LiveStart:
             grips=tuple(tuple(int(number) for number in grip) for grip in ready["grips"]),
             speed_m_s=float(ready["speed_m_s"]),
             reach_m=float(ready["reach_m"]),
+            holding=tuple(tuple(int(number) for number in grips) for grips in ready.get("holding", ())),
             factors=tuple(map(str, ready.get("factors", ()))),
             strengths=tuple(
                 LiveStrength(one["name"], one["unit"], *(float(one[key]) for key in ("low", "high", "value")))

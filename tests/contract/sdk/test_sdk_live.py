@@ -96,6 +96,26 @@ def test_a_body_gets_other_properties_and_a_property_that_is_not_there_ends_the_
         lifted({"colour": 2.0})
 
 
+def test_a_grip_is_opened_and_falls_with_the_material(served: Served, client: Client) -> None:
+    bar = {"name": "tiny-between", "kind": "between two grips"}
+    model, version = publish_tiny(served.database, served.stores.artifacts, **bar)
+    with client.live.open(model, version) as session:
+        start = session.start
+        assert start.holding == ((0,), (0, 1))
+        session.open_grips([1])
+        for frame in session:
+            if frame.controllers[4:, 2].mean() < start.controllers[4:, 2].mean() - 3e-3:
+                break
+        assert frame.controllers[:4] == pytest.approx(start.controllers[:4], abs=1e-6)
+        session.open_grips([])
+        closed = [frame.controllers for frame in islice(session, 40)]
+        assert closed[-1] == pytest.approx(closed[-10], abs=1e-6)
+    with client.live.open(model, version) as session, pytest.raises(LiveSessionEnded, match="would hold"):
+        session.open_grips([0])
+        for _ in range(200):
+            session.frame()
+
+
 def test_a_session_that_is_closed_says_so(served: Served, client: Client) -> None:
     with client.live.open(served.model) as session:
         pass

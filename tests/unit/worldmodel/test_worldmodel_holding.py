@@ -23,6 +23,7 @@ from physworld.worldmodel.holding.spans import (
     train_held,
 )
 from physworld.worldmodel.holding.taking import taken_hold, vertices_near
+from physworld.worldmodel.live import LiveRollout
 from physworld.worldmodel.model.config import TrainingConfig
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.skinning import affine_skin
@@ -263,7 +264,8 @@ def test_what_a_rollout_cannot_follow_is_said(models: HeldModels) -> None:
         HeldModels({LEFT: models.members[BOTH]}, GRIPS)
 
 
-def test_published_versions_roll_out_together(models: HeldModels) -> None:
+def published_versions(models: HeldModels) -> list[PublishedModel]:
+    """Of both grips and of the left one, as they are read back."""
     arrays = every()[LEARNED]
     true, controllers = true_path(arrays), arrays["controllers"].astype(float)
     versions = []
@@ -280,6 +282,13 @@ def test_published_versions_roll_out_together(models: HeldModels) -> None:
             holding=holding,
         )
         versions.append(PublishedModel.from_tensors(version.to_tensors(), version.facts()))
+    return versions
+
+
+def test_published_versions_roll_out_together(models: HeldModels) -> None:
+    arrays = every()[LEARNED]
+    true, controllers = true_path(arrays), arrays["controllers"].astype(float)
+    versions = published_versions(models)
     assert [version.holding for version in versions] == [None, LEFT]
     together = HeldVersions.of(versions).rollout(controllers, arrays["holding"])
     expected = models.rollout(true[: H + 1], controllers, arrays["holding"], PHI)
@@ -289,6 +298,44 @@ def test_published_versions_roll_out_together(models: HeldModels) -> None:
     before = {name: fact for name, fact in versions[0].facts().items() if name not in {"grips", "holding"}}
     old = PublishedModel.from_tensors(versions[0].to_tensors(), before)
     assert (old.holding, old.grips) == (None, ())
+
+
+def test_a_live_session_lets_go_and_takes_hold_as_a_rollout_does(models: HeldModels) -> None:
+    """The hand stays where it let go; from closing on the material moves by the hand's motion."""
+    versions = published_versions(models)
+    whole = replace(versions[0], others=(versions[1],))
+    hands, opened, closed = versions[0].start_controllers[-1], 9, 17
+    moves = np.zeros((40, 8, 3))
+    ticks = np.arange(40) - H
+    moves[:, :4] = 0.01 * np.sin(0.3 * np.maximum(ticks, 0))[:, None, None]
+    moves[:, 4:, 2] = (
+        0.0015 * np.where(ticks < opened, ticks, np.maximum(ticks - closed, 0) + opened)[:, None]
+    )
+    moves[: H + 1] = 0.0
+    controllers = hands + moves
+    controllers[: H + 1] = versions[0].start_controllers
+    holding = np.ones((40, 2), dtype=np.uint8)
+    holding[H + opened : H + closed, 1] = 0
+    expected = HeldVersions.of_one(whole).rollout(controllers, holding)
+
+    session = LiveRollout(whole)
+    assert session.sets == [LEFT, BOTH]
+    for round_ in range(2):
+        carried = []
+        for tick in range(40 - H - 1):
+            session.hold([g for g in BOTH if holding[H + tick, g]])
+            places = session.controllers + np.diff(controllers, axis=0)[H + tick]
+            session.step(places)
+            carried.append(session.controllers[4:].mean(axis=0))
+            assert np.abs(session.vertices - expected[H + tick + 1]).max() < ROUNDING_M, (round_, tick)
+        fell = np.ptp(np.array(carried)[opened:closed, 2])
+        assert fell > 3e-4, "the open grip does not go along with the material"
+        with pytest.raises(GraphInvalid, match=r"grips \[1\] are to hold; .* \[0\], \[0, 1\]"):
+            session.hold([1])
+        assert session.holding == BOTH
+        session.hold(LEFT)
+        session.reset()
+        assert session.holding == BOTH
 
 
 def test_a_grip_that_is_open_at_the_start_closes_where_its_hand_is(models: HeldModels) -> None:

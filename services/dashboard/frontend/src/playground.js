@@ -1,6 +1,6 @@
 // The playground: `<figure data-playground="URL">` opens a live session of a world model and draws its answers.
 // POST to URL gives { path }, the WebSocket's address with a ticket. The first message is JSON: { dt_s, points,
-//   controllers [[x, y, z]], grips [[index]], speed_m_s, reach_m, factors [name], strengths [{ name, label, unit,
+//   controllers [[x, y, z]], grips [[index]], holding [[grip]], speed_m_s, reach_m, factors [name], strengths [{ name, label, unit,
 //   low, high, value }], start [[x, y, z]] }. Then binary frames, little-endian:
 //   uint32 tick, uint32 number of the last control, float32 time, uint32 flags, float32 points and controllers [m]; those
 //   with flag 2 are of the twin (`twin.js`), of which texts { type: "twin" } tell.
@@ -10,6 +10,7 @@ import { Plane, Raycaster, Vector2, Vector3 } from "three";
 import { onSchemeChange } from "./palette.js";
 import { Factors } from "./factors.js";
 import { Ghost } from "./ghost.js";
+import { Grips } from "./grips.js";
 import { Cloud } from "./points.js";
 import { Recorder } from "./record.js";
 import { Splat } from "./splat.js";
@@ -18,7 +19,8 @@ import { LiveTwin } from "./twin.js";
 import { View } from "./view.js";
 
 const HEAD_BYTES = 16;
-const OF_TWIN = 2; // a flag of frames
+const SET_BACK = 1; // flags of frames
+const OF_TWIN = 2;
 const PICK_PIXELS = { mouse: 28, pen: 32, touch: 48 };
 const SETTLE_S = 0.5; // after the end of the recorded motion, to arrive
 const STILL = 1e-3; // of the body's size: a grip that is so near its target stays where it is
@@ -67,8 +69,9 @@ class Playground {
     this.frames = 0;
     this.clouds = [];
     this.factors = new Factors(figure.querySelector("[data-factors]"), (factors, strengths) => this.tell({ type: "factors", factors, strengths }));
+    this.holding = new Grips(figure.querySelector("[data-grips]"), (open) => this.tell({ type: "open", grips: open }));
     const offer = (strengths) => this.factors.beside(strengths);
-    this.twin = new LiveTwin(figure, this.view.scene, (message) => this.tell(message), offer);
+    this.twin = new LiveTwin(figure, this.view.scene, (message) => this.ask(message), offer);
     const pressed = (name, then) => figure.querySelector(`[data-${name}]`).addEventListener("click", then);
     pressed("reset", () => this.again());
     pressed("view", () => this.look());
@@ -166,8 +169,15 @@ class Playground {
   /** A fresh body: in the present session, or in a new one where that has ended. */
   again() {
     this.replayed = null;
+    this.holding.reset();
     if (this.tell({ type: "reset" })) return;
     if (this.socket?.readyState !== WebSocket.CONNECTING) this.open().catch((error) => this.say(error.message));
+  }
+
+  /** Ask for the twin, with which both begin again, or send it away. */
+  ask(message) {
+    if (message.on) this.holding.reset();
+    this.tell(message);
   }
 
   /** Send a message as text; false where there is no session to tell. */
@@ -195,6 +205,7 @@ class Playground {
     this.dress();
     this.places = this.grips(new Float32Array(ready.controllers.flat()));
     this.factors.offer(ready.factors, ready.strengths ?? []);
+    this.holding.offer(ready.grips.length, ready.holding ?? []);
     this.twin.begin(ready.points, ready.dt_s);
     this.say("");
     this.figure.dataset.ready = "true";
@@ -233,6 +244,7 @@ class Playground {
       this.twin.take(tick, values.subarray(0, size));
       return;
     }
+    if (flags & SET_BACK) this.holding.reset();
     const heard = number !== this.acknowledged; // for the first time: later frames of the same control tell no delay
     this.acknowledged = number;
     this.twin.follow(tick, values.subarray(0, size));

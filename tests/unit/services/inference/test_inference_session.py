@@ -134,3 +134,64 @@ def test_a_frame_between_two_ticks_is_of_one_moment() -> None:
     places = [np.frombuffer(frame, "<f4", offset=HEAD.size) for frame in (first, between, newest)]
     assert places[1] == pytest.approx(0.5 * (places[0] + places[2]), abs=1e-7)
     assert places[2][-1] - places[0][-1] == pytest.approx(0.3 * session.dt_s, abs=1e-6)
+
+
+def test_a_grip_lets_go_and_takes_hold_where_the_material_is() -> None:
+    session = LiveSession(tiny_model("between two grips")[2])
+    assert session.describe()["holding"] == [[0], [0, 1]]
+    still, up = np.zeros((8, 3)), np.zeros((8, 3))
+    up[4:, 2] = 0.3
+
+    def far_grip() -> np.ndarray:
+        return np.asarray(session.controllers[4:].mean(axis=0))
+
+    def ticks(velocity: np.ndarray, count: int) -> np.ndarray:
+        before = far_grip()
+        for _ in range(count):
+            session.tick(velocity)
+        return far_grip() - before
+
+    assert np.abs(ticks(still, 5)).max() == 0.0
+    session.open_grips([1])
+    fallen = ticks(up, 20)  # nobody leads an open grip
+    assert fallen[2] < -3e-3
+    session.open_grips([])
+    assert ticks(still, 1) == pytest.approx(np.zeros(3), abs=1e-12)
+    assert ticks(up, 5)[2] == pytest.approx(5 * 0.3 * session.dt_s)
+    session.open_grips([1])
+    session.reset()
+    assert ticks(up, 5)[2] == pytest.approx(5 * 0.3 * session.dt_s), "a reset closes every grip"
+
+
+def test_a_grip_that_closed_beyond_its_reach_does_not_jump() -> None:
+    session = LiveSession(tiny_model("between two grips")[2])
+    session.open_grips([1])
+    for _ in range(10):
+        session.tick(np.zeros((8, 3)))
+    session.reach_m = 1e-3
+    session.open_grips([])
+    before = session.controllers.copy()
+    assert before[4, 2] < session.describe()["controllers"][4][2] - session.reach_m
+    down = np.tile([0.0, 0.0, -0.3], (8, 1))
+    session.tick(down)
+    moved = session.controllers - before
+    assert moved[4:] == pytest.approx(np.zeros((4, 3)), abs=1e-12), "and goes no further"
+    session.tick(-down)
+    assert (session.controllers - before)[4:, 2] == pytest.approx(np.full(4, 0.3 * session.dt_s))
+
+
+@pytest.mark.parametrize(
+    ("grips", "words"),
+    [
+        ([0], r"grips \[1\] would hold; the version has models of \[0\], \[0, 1\]"),
+        ([0, 1], r"grips \[\] would hold"),
+        ([2], r"grips \[2\] are to open; the session has 2, from 0 on"),
+        ([True], r"grips \[True\] are to open"),
+        (["1"], r"grips \['1'\] are to open"),
+    ],
+)
+def test_grips_that_no_model_is_for_stay_closed(grips: list[Any], words: str) -> None:
+    with pytest.raises(ControlRefused, match=words):
+        LiveSession(tiny_model("between two grips")[2]).open_grips(grips)
+    with pytest.raises(ControlRefused, match=r"grips \[\] would hold; the version has models of \[0\]$"):
+        LiveSession(tiny_model()[2]).open_grips([0])

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from safetensors.numpy import load
-from tiny_scene import LENGTH_M, SIDE_M, register, tiny_scene
+from tiny_scene import between_two_grips, register
 
-from physworld.scene import Grip, Scene
 from physworld.worldmodel import PublishedModel
 from physworld.worldmodel.errors import ControlsInvalid
 from physworld.worldmodel.holding.rollout import HeldVersions
@@ -51,24 +50,6 @@ SMALL = TrainingConfig(
 )
 
 
-def two_grips() -> Scene:
-    """The tiny bar with a grip at either end; both move alike."""
-    bar = tiny_scene(FRAMES)
-    half = SIDE_M / 2
-    far = Grip(
-        controllers=(4, 5, 6, 7),
-        region_min_m=np.array([LENGTH_M - 0.02, -half, -half]),
-        region_max_m=np.array([LENGTH_M, half, half]),
-    )
-    return dataclasses.replace(
-        bar,
-        controllers=np.concatenate(
-            [bar.controllers, bar.controllers + np.array([LENGTH_M, 0.0, 0.0])], axis=1
-        ),
-        grips=(*bar.grips, far),
-    )
-
-
 @pytest.fixture
 def runtime(tmp_path: Path) -> Iterator[Runtime]:
     """One process that knows every kind of shard, on stores of its own."""
@@ -102,7 +83,7 @@ def dataset_id(runtime: Runtime, monkeypatch: pytest.MonkeyPatch) -> str:
         return write(self, dataset, index, epoch, {**arrays, "holding": holding}, attributes)
 
     monkeypatch.setattr(EpisodeStore, "write", with_holding)
-    scene_id = register(two_grips(), runtime.database, runtime.stores.artifacts)
+    scene_id = register(between_two_grips(FRAMES), runtime.database, runtime.stores.artifacts)
     with runtime.database.session() as session:
         fit = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=2))
     _drain(runtime)
@@ -200,7 +181,7 @@ def test_grips_are_named_once_and_in_order() -> None:
 def test_a_recording_in_which_a_grip_lets_go_gives_one_version_that_follows_it(
     runtime: Runtime, tmp_path: Path
 ) -> None:
-    scene, fps = two_grips(), 30.0
+    scene, fps = between_two_grips(FRAMES), 30.0
     far = dataclasses.replace(scene.grips[1], open_s=((OPENED / fps, CLOSED / fps),))
     scene_id = register(
         dataclasses.replace(scene, grips=(scene.grips[0], far)), runtime.database, runtime.stores.artifacts
