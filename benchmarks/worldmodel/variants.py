@@ -24,7 +24,7 @@ from physworld.worldmodel.training import train
 
 MODEL = WorldModelConfig(hidden=64, message_passing_steps=7, vertices=80)
 TRAINING = TrainingConfig(steps=240, checkpoint_every=10**9)
-TIMED_STEPS = 4
+TIMED_STEPS = 40
 SMALL = {"message_passing_steps": 3, "hidden": 48}
 MOST_STEPS = 200_000
 
