@@ -76,4 +76,7 @@ class PlainNetwork(nn.Module):
                 )
             state = state + model.update_out[layer](torch.relu(inner))
         n = model.spec.object_count
-        return model.decoder(state[:n]) + model.skip(features[:n])
+        correction = model.decoder(state[:n]) + model.skip(features[:n])
+        return (
+            correction if model.modes is None else correction + model.modes(window, ahead) / model.norm.change
+        )

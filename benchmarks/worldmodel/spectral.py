@@ -46,7 +46,7 @@ def graph_modes(rest: np.ndarray, count: int) -> np.ndarray:
 class SpectralModel(WorldModel):
     """The network of the module's text; ``tracks`` give the sizes of the modes."""
 
-    modes: Tensor
+    waves: Tensor
     middle: Tensor
     place: Tensor
     speed: Tensor
@@ -55,10 +55,10 @@ class SpectralModel(WorldModel):
     control_place: Tensor
 
     def __init__(self, config: WorldModelConfig, spec: GraphSpec, *rest: Any, tracks: list[Track]) -> None:
-        super().__init__(config, spec, *rest)
+        super().__init__(config, spec, *rest[:3])  # without the product's own map of modes
         modes = torch.as_tensor(graph_modes(spec.rest_vertices, MODES), dtype=torch.float32)
         n, count, h, hidden = spec.object_count, modes.shape[1], config.history, config.hidden
-        self.register_buffer("modes", modes)
+        self.register_buffer("waves", modes)
         self.mix = nn.ParameterList(
             nn.Parameter(torch.zeros(count, hidden, hidden)) for _ in range(config.message_passing_steps)
         )
@@ -88,7 +88,7 @@ class SpectralModel(WorldModel):
             constants: ``edge_constants()``, when many steps share the weights.
         """
         constants = constants or self.edge_constants()
-        n, modes = self.spec.object_count, self.modes
+        n, modes = self.spec.object_count, self.waves
         moves = (window[1:] - window[:-1]).flip(0)
         grounded = self.spec.ground_height_m is not None
         features = vertex_features(window, moves, ahead, phi, self.norm, grounded=grounded)
@@ -109,7 +109,7 @@ class SpectralModel(WorldModel):
 
     def _global(self, shifted: Tensor, moves: Tensor, prior: Tensor) -> Tensor:
         """The linear map, (n, B, 3), of displacements (V, B, 3), moves (h, V, B, 3), the prior's move (n, B, 3) [m]."""
-        n, modes = self.spec.object_count, self.modes
+        n, modes = self.spec.object_count, self.waves
 
         def own(values: Tensor, size: Tensor) -> Tensor:
             found = torch.tensordot(modes, values, dims=([0], [0])) / n / size[:, None]

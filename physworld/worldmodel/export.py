@@ -55,7 +55,7 @@ class StepProgram(nn.Module):
         self.encoder, self.decoder = nn.Sequential(*model.encoder), nn.Sequential(*model.decoder)
         self.receive, self.send, self.edge = model.receive, model.send, model.edge
         self.update_in, self.update_out, self.skip = model.update_in, model.update_out, model.skip
-        self.norm, self.prior = model.norm, model.prior
+        self.norm, self.prior, self.modes = model.norm, model.prior, model.modes
         self.frame = spec.frame
         self.radius = spec.edge_radius_m if spec.current_neighbours else None
 
@@ -110,6 +110,8 @@ class StepProgram(nn.Module):
             state = state + self.update_out[layer](torch.relu(inner))
         correction = self.decoder(state[:n]) + self.skip(features[:n])
         moved = prior + self.norm.change * correction
+        if self.modes is not None:
+            moved = moved + self.modes(window[:, :, None], ahead[:, None])[:, 0]
         if frame is not None:
             moved = leave(frame, turn, moved[:, None])[:, 0]
         return torch.cat([moved, moved_to])

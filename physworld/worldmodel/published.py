@@ -45,6 +45,7 @@ from physworld.worldmodel.model.frame import GripFrame
 from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.modes import ModeScales
 from physworld.worldmodel.model.properties import PhiColumn, columns_of, with_named
 from physworld.worldmodel.model.skinning import Beside, Skin
 from physworld.worldmodel.native.engine import RolloutEngine
@@ -185,6 +186,8 @@ class PublishedModel:
         network = {name: value.numpy(force=True) for name, value in self.model.state_dict().items()}
         if np.any(network.get("prior.natural", 0.0)):
             network[_COILED] = network.pop("prior.curve")
+        if self.model.modes is not None:
+            network[_BESIDE_MODES] = network.pop("skip.weight")
         return (
             {name: np.ascontiguousarray(value) for name, value in network.items()}
             | {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in single.items()}
@@ -205,6 +208,7 @@ class PublishedModel:
             "control_vertices": spec.control_count,
             "edges": spec.edge_count,
             "frame": "world" if spec.frame is None else "grip",
+            "mapped_modes": 0 if self.model.modes is None else len(self.model.modes.shapes),
             "phi": [
                 one.described(float(spread))
                 for one, spread in zip(self.columns, self.model.norm.properties, strict=True)
@@ -247,8 +251,8 @@ class PublishedModel:
         if "prior.spread" in tensors:  # chains of earlier versions are straight
             held = straight(len(tensors["prior.mass"]))
             tensors = {f"prior.{name}": value for name, value in held.items()} | tensors
-        if _COILED in tensors:
-            tensors = {"prior.curve" if name == _COILED else name: value for name, value in tensors.items()}
+        own_names = {_COILED: "prior.curve", _BESIDE_MODES: "skip.weight"}
+        tensors = {own_names.get(name, name): value for name, value in tensors.items()}
         names = WorldModelConfig.__dataclass_fields__
         config = WorldModelConfig(**{name: facts[name] for name in names})
         current = int(tensors["graph.current_neighbours"][0]) if config.near_edges == "current" else 0
@@ -268,7 +272,8 @@ class PublishedModel:
         )
         prior = _prior_of(tensors)
         _refuse_other_sizes(tensors, prior, config, spec)
-        model = WorldModel(config, spec, prior=prior, columns=columns_of(facts.get("phi")))
+        columns = columns_of(facts.get("phi"))
+        model = WorldModel(config, spec, prior=prior, columns=columns, modes=_modes_of(tensors))
         network = {name: value for name, value in tensors.items() if not name.startswith(_OWN)}
         model.load_state_dict({name: torch.as_tensor(value) for name, value in network.items()})
         return cls(
@@ -288,6 +293,7 @@ class PublishedModel:
 _COILED = (
     "prior.coiled_curve"  # ``prior.curve`` of a coiled chain: a reader that does not know of coils finds none
 )
+_BESIDE_MODES = "skip.beside_modes.weight"  # ``skip.weight`` beside a linear map of modes: the same
 _FACTS_BEFORE = {"near_edges": "material"}  # what versions were that do not say it
 
 
@@ -335,6 +341,13 @@ def _prior_of(tensors: dict[str, Array]) -> ModalPrior | ChainPrior | InertialPr
     return ChainPrior(**parts)
 
 
+def _modes_of(tensors: dict[str, Array]) -> ModeScales | None:
+    """The linear map of modes beside the network, where there is one."""
+    if "modes.shapes" not in tensors:
+        return None
+    return ModeScales(**{name: tensors[f"modes.{name}"] for name in ModeScales.__dataclass_fields__})
+
+
 def _refuse_other_sizes(
     tensors: dict[str, Array],
     prior: ModalPrior | ChainPrior | InertialPrior,
@@ -359,6 +372,15 @@ def _refuse_other_sizes(
         }
     if spec.frame is not None:
         expected |= {"graph.frame_shape": (controls, 3), "graph.frame_fall": (3,), "graph.frame_line": (3,)}
+    if "modes.shapes" in tensors:
+        shapes, width = len(tensors["modes.shapes"]), 3 * (frames + 1)
+        inputs = width * (shapes + controls)
+        expected |= {
+            "modes.shapes": (shapes, n),
+            "modes.change": (shapes,),
+            "modes.weight": (inputs, 3 * shapes),
+        }
+        expected |= {"modes.middle": (inputs,), "modes.scale": (inputs,)}
     if isinstance(prior, ModalPrior):
         modes = len(prior.basis)
         expected["prior.mean"] = (n, 3)

@@ -45,8 +45,10 @@ from physworld.worldmodel.model.features import Normalisation, Scales
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.inertia import one_step_residual
 from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.modes import measure_modes
 from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
 from physworld.worldmodel.priors.choose import choose, fit_priors, prior_error, spec_for
+from physworld.worldmodel.priors.modal import ModalPrior
 from physworld.worldmodel.priors.prior_step import framed_prior, prior_step
 from physworld.worldmodel.rollout import mean_error, rollout_tracks
 
@@ -187,9 +189,11 @@ def train(
         spec,
         lambda track: one_step_residual(ahead, track.positions, track.phi, spec.object_count, h),
     )
+    modal = isinstance(prior, ModalPrior)
+    modes = None if modal else measure_modes([track.positions for track in fitting], spec, h)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(training.seed)
-        model = network(config, spec, scales, prior, columns).to(device)
+        model = network(config, spec, scales, prior, columns, modes).to(device)
     run = _start(model, scales, training)
     identity = _identity(config, training, scales)
     if checkpoint is not None:

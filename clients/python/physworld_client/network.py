@@ -25,6 +25,7 @@ EDGE_KINDS = 3  # near, coarse, grip
 PROPERTY_COUNT = 2
 NEAR = 0
 OPPOSITE = 1e-3  # least 1 + cos of the turn of a grip whose points lie on a line
+MODES_BOUND = 3.0  # sizes at which what the map of modes sees is cut
 REST_RADII = 2.0  # longest rest length that a NEAR edge found at a step tells, in edge radii
 
 
@@ -83,6 +84,7 @@ class Network:
         self.layers = sum(name.startswith("receive.") and name.endswith(".weight") for name in tensors)
         self._nearest = int(tensors.get("graph.current_neighbours", np.zeros(1))[0])
         self._framed = "graph.frame_shape" in tensors
+        self._modal_map = "modes.shapes" in tensors
         self._table = "graph.kept_neighbours" if self._nearest else "graph.neighbours"
         if self._framed:
             self._table = "graph.turned_neighbours"
@@ -150,9 +152,29 @@ class Network:
             messages = np.maximum(heard[edges.receivers] + sent[edges.senders] + terms[:, layer], 0.0)
             inner = self._linear(f"update_in.{layer}", np.hstack([state, self._means(edges, messages)]))
             state = state + self._linear(f"update_out.{layer}", np.maximum(inner, 0.0))
-        correction = self._mlp("decoder", state[:n]) + features[:n] @ self._tensor("skip.weight").T
-        ahead[:n] += self._scale("change") * correction.astype(np.float64)
+        skip = "skip.beside_modes.weight" if self._modal_map else "skip.weight"
+        correction = self._mlp("decoder", state[:n]) + features[:n] @ self._tensor(skip).T
+        moved = self._scale("change") * correction.astype(np.float64)
+        if self._modal_map:
+            moved += self._modes(window, ahead)
+        ahead[:n] += moved
         return ahead
+
+    def _modes(self, window: Array, ahead: Array) -> Array:
+        """What the linear map of modes adds [m], (n, 3): ``physworld.worldmodel.model.modes``."""
+        n, frames = self.object_count, window[::-1]
+        shapes = self._tensor("modes.shapes").astype(np.float64)
+        middle, now = window[-1, n:].mean(axis=0), window[-1]
+        moves = frames[:-1] - frames[1:]
+        bends = moves[:-1, :n] - moves[1:, :n]
+        own = np.concatenate([[now[:n] - middle, moves[0, :n]], bends, [ahead[:n] - now[:n]]])
+        held = np.concatenate([[now[n:] - middle, ahead[n:] - now[n:]], moves[:, n:]])
+        raw = np.concatenate([np.einsum("rn,pnk->prk", shapes, own).ravel() / n, held.ravel()])
+        seen = np.clip(
+            (raw - self._tensor("modes.middle")) / self._tensor("modes.scale"), -MODES_BOUND, MODES_BOUND
+        )
+        moved = (seen @ self._tensor("modes.weight")).reshape(-1, 3) * self._tensor("modes.change")[:, None]
+        return np.asarray(shapes.T @ moved)
 
     def _prior(self, window: Array, control_next: Array, phi: Array) -> Array:
         """x̂^{t+1} of the object vertices [m], (n, 3)."""

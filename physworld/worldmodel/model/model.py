@@ -53,6 +53,9 @@ not 0, prior.curve is named prior.coiled_curve.
 
 **No prior**: ``physworld.worldmodel.model.inertia``; prior.lags (2,) in place of the modal prior's tensors.
 
+**Beside a chain and without a prior** a linear map of the body's modes is added to x_i^{t+1}:
+``physworld.worldmodel.model.modes`` has its equations and tensors.
+
 **In the grip's frame**, where ``graph.frame_shape`` is among the tensors: all of the above holds for y in place of x
 (``physworld.worldmodel.model.frame``). The edges then stand in ``graph.turned_neighbours``, of the shape and meaning of
 ``graph.neighbours``, which such a model lacks.
@@ -108,6 +111,7 @@ from physworld.worldmodel.model.features import Normalisation, Scales, vertex_fe
 from physworld.worldmodel.model.frame import Turn, enter, leave
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
+from physworld.worldmodel.model.modes import ModalMap, ModeScales
 from physworld.worldmodel.model.nearest import CurrentEdges, KeptEdges
 from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
 from physworld.worldmodel.native.messages import EdgeList, as_seen, mean_messages
@@ -148,6 +152,7 @@ class WorldModel(nn.Module):
         normalisation: Normalisation | None = None,
         prior: ModalPrior | ChainPrior | InertialPrior | None = None,
         columns: tuple[PhiColumn, ...] = PROPERTIES,
+        modes: ModeScales | None = None,
     ) -> None:
         """Random weights, whose output is 0.
 
@@ -157,6 +162,7 @@ class WorldModel(nn.Module):
             normalisation: scales of the data; 1 without them.
             prior: what is under the network; without one the body follows its grips rigidly.
             columns: what the columns of Φ stand for, ``PROPERTIES`` first.
+            modes: of the linear map beside the messages (``physworld.worldmodel.model.modes``); None: there is none.
         """
         super().__init__()
         self.config = config
@@ -175,6 +181,7 @@ class WorldModel(nn.Module):
         self.update_out = nn.ModuleList(nn.Linear(hidden, hidden) for _ in range(layers))
         self.decoder = TwoLayers(hidden, hidden, 3)
         self.skip = nn.Linear(vertex_features, 3, bias=False)
+        self.modes = None if modes is None else ModalMap(modes)
         for start in (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias):
             nn.init.zeros_(start)  # an untrained network leaves the prior as it is
         self._set_graph(spec)
@@ -234,6 +241,8 @@ class WorldModel(nn.Module):
             inner = self.update_in[layer](torch.cat([state, *mean.unbind(0)], dim=-1))
             state = state + self.update_out[layer](torch.relu(inner))
         correction: Tensor = self.decoder(state[:n]) + self.skip(features[:n])
+        if self.modes is not None:
+            correction = correction + self.modes(window, ahead) / self.norm.change
         return correction
 
     def _material_means(self, now: Tensor, shifted: Tensor, constants: EdgeConstants) -> Means:
@@ -309,7 +318,8 @@ class WorldModel(nn.Module):
 
     def corrects_prior(self) -> bool:
         """Whether the network adds anything to the prior: not before the first step of training."""
-        ends = (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias)
+        ends = [self.skip.weight, self.decoder.out.weight, self.decoder.out.bias]
+        ends += [] if self.modes is None else [self.modes.weight]
         return any(bool(torch.any(weight != 0)) for weight in ends)
 
     @property
@@ -337,7 +347,8 @@ class WorldModel(nn.Module):
 
     @torch.no_grad()
     def take(self, other: WorldModel) -> None:
-        """Go on from the weights of another body's network, which are in units of each body's own scales.
+        """Go on from the weights of another body's network, which are in units of each body's own scales; its map of
+        modes is of that body, and is not taken.
 
         Shared columns of Φ, and a ground where the other body has none, are not heard at first.
 
@@ -357,6 +368,8 @@ class WorldModel(nn.Module):
         kinds = first + len(self.shared_columns)
         learned = dict(other.named_parameters())
         for name, weight in self.named_parameters():
+            if name.startswith("modes."):
+                continue
             theirs = learned[name]
             if weight.shape == theirs.shape:
                 weight.copy_(theirs)

@@ -65,6 +65,13 @@ class RolloutEngine:
                     ("frame_line", frame.line),
                 )
             }
+        if model.modes is not None:
+            self._fixed |= {
+                f"mode_{name}": _floats(getattr(model.modes, name))
+                for name in ("shapes", "middle", "scale", "change")
+            }
+            inputs, width = model.modes.weight.shape
+            self._fixed["mode_weight"] = _padded(model.modes.weight, inputs, -(-width // REGISTER) * REGISTER)
         modal = model.prior if isinstance(model.prior, PriorStep) else None
         self._placing = None if modal is None else modal.placing.numpy(force=True).astype(np.float64)
         low, high = (0.0, 0.0) if modal is None else modal.span.tolist()
@@ -91,6 +98,8 @@ class RolloutEngine:
             "places_width": 3 * (config.history + 2),
             "grounded": int(spec.ground_height_m is not None),
             "framed": 0 if frame is None else 1 + int(np.any(frame.line)),
+            "shapes": 0 if model.modes is None else model.modes.shapes.shape[0],
+            "seen": 0 if model.modes is None else model.modes.weight.shape[0],
         }
         self._sizes |= chain_sizes(chain, config.history) if chain is not None else {}
 
@@ -166,6 +175,12 @@ class RolloutEngine:
             "ahead": 3 * self.vertices,
             "window": 3 * self.vertices * (self.history + 2) if sizes["framed"] else 0,
         }
+        if sizes["shapes"]:
+            parts, moved = (
+                -(-3 * count // REGISTER) * REGISTER for count in (self.history + 2, sizes["shapes"])
+            )
+            scratch |= {"mode_parts": self.objects * parts, "mode_own": sizes["shapes"] * parts}
+            scratch |= {"mode_seen": sizes["seen"], "mode_moved": moved}
         arrays = self._fixed | {name: np.zeros(count, dtype=np.float32) for name, count in scratch.items()}
         arrays |= {"paths": path, "phis": phi, "softnesses": soft, "logs": logs}
         if sizes["nearest"]:

@@ -25,6 +25,7 @@ wp.set_module_options({"enable_backward": False})
 SIZES = (
     "candidates", "corrected", "first", "frames", "history", "objects", "vertices", "edges", "layers", "hidden",
     "modes", "controls", "inputs", "places_width", "grounded", "chained", "inertial", "nearest", "framed",
+    "shapes", "seen",
     *CHAIN_SIZES,
 )  # fmt: skip
 SCALARS = ("per_velocity", "change", "per_length", "radius", "longest_rest")
@@ -38,7 +39,9 @@ ARRAYS = (
     "decode_in", "decode_in_bias", "decode_out", "decode_out_bias", "skip",
     "features", "places", "state", "hear", "say", "placed", "heard", "sent", "sums", "inner", "correction",
     "length", "regressors", "ahead", "logs", "found", "search_room",
-    "frame_shape", "frame_fall", "frame_line", "window", *CHAIN_ARRAYS,
+    "frame_shape", "frame_fall", "frame_line", "window",
+    "mode_shapes", "mode_middle", "mode_scale", "mode_change", "mode_weight", "mode_parts", "mode_own", "mode_seen",
+    "mode_moved", *CHAIN_ARRAYS,
 )  # fmt: skip
 INTEGER_ARRAYS = frozenset({"offsets", "edge_sender", "edge_receiver", "gapped", "found"})
 
@@ -128,6 +131,43 @@ _ROLLOUT = (
                         * (path[((long long)t * VN + i) * 3 + k] - centre[k] - mean[i * 3 + k]);
             amplitudes[(long long)t * R + m] = sum;
         }
+    };
+    // what the linear map of modes adds to ``next``: physworld.worldmodel.model.modes
+    auto add_modes = [&](int t, float* next) {
+        const int M = shapes, P = history + 2, W = (3 * P + 15) / 16 * 16, D = (3 * M + 15) / 16 * 16;
+        const long long tick = 3LL * VN;
+        const float* now = path + t * tick;
+        float here[3];
+        centre_of(t, here);
+        auto part = [&](int p, int v, int k, bool held) -> float {
+            const float* x = now + 3 * v + k;
+            if (p == 0) return x[0] - here[k];
+            if (held) return p == 1 ? ahead[3 * v + k] - x[0] : x[-(p - 2) * tick] - x[-(p - 1) * tick];
+            if (p == 1) return x[0] - x[-tick];
+            if (p == P - 1) return ahead[3 * v + k] - x[0];
+            return x[-(p - 2) * tick] - 2.0f * x[-(p - 1) * tick] + x[-p * tick];
+        };
+        for (int i = 0; i < N; ++i)
+            for (int p = 0; p < P; ++p)
+                for (int k = 0; k < 3; ++k) mode_parts[i * W + 3 * p + k] = part(p, i, k, false);
+        product(mode_own, mode_shapes, mode_parts, nullptr, M, N, W, false);
+        int f = 0;
+        for (int p = 0; p < P; ++p)
+            for (int r = 0; r < M; ++r)
+                for (int k = 0; k < 3; ++k) mode_seen[f++] = mode_own[r * W + 3 * p + k] / N;
+        for (int p = 0; p < P; ++p)
+            for (int c = 0; c < C; ++c)
+                for (int k = 0; k < 3; ++k) mode_seen[f++] = part(p, N + c, k, true);
+        for (int j = 0; j < seen; ++j) {
+            const float s = (mode_seen[j] - mode_middle[j]) / mode_scale[j];
+            mode_seen[j] = s < -3.0f ? -3.0f : (s > 3.0f ? 3.0f : s);
+        }
+        product(mode_moved, mode_seen, mode_weight, nullptr, 1, seen, D, false);
+        for (int r = 0; r < M; ++r)
+            for (int k = 0; k < 3; ++k) {
+                const float moved = mode_moved[3 * r + k] * mode_change[r];
+                for (int i = 0; i < N; ++i) next[3 * i + k] += mode_shapes[r * N + i] * moved;
+            }
     };
     for (int b = 0; b < candidates; ++b) {
         float* world = paths + (long long)b * frames * VN * 3;
@@ -308,6 +348,7 @@ _ROLLOUT = (
             product(correction, features, skip, nullptr, N, inputs, 16, true);
             for (int i = 0; i < N; ++i)
                 for (int k = 0; k < 3; ++k) next[i * 3 + k] = ahead[i * 3 + k] + change * correction[i * 16 + k];
+            if (shapes) add_modes(t, next);
             if (framed) leave(next, world + (long long)(t + 1) * VN * 3);
         }
     }

@@ -25,6 +25,7 @@ from physworld.worldmodel.model.frame import enter, leave
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.modes import ModeScales, measure_modes
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.priors.chain import ChainPhysics, ChainPrior, chain_of
 from physworld.worldmodel.priors.chain_layout import arc_lengths, held_vertices, lay_out
@@ -54,6 +55,7 @@ def bar(
     alone: bool = False,
     framed: bool = False,
     line: bool = False,
+    modes: bool = False,
 ) -> tuple[WorldModel, Inputs]:
     spec = held_bar.graph(config, ground, framed=framed)
     if line:  # as for a grip whose points lie on a line
@@ -72,12 +74,14 @@ def bar(
         given = dataclasses.replace(
             given, window=given.window @ turn.T, control_next=given.control_next @ turn.T
         )
-    return moving(config, spec, prior), given
+    scales = measure_modes([track.positions for track in tracks], spec, config.history) if modes else None
+    return moving(config, spec, prior, scales), given
 
 
-def rope(markers: int, *, coiled: bool = False) -> tuple[WorldModel, Inputs]:
+def rope(markers: int, *, coiled: bool = False, modes: bool = False) -> tuple[WorldModel, Inputs]:
     config, spec = hanging_rope.SMALL, hanging_rope.graph(markers)
-    path = read_track(spec, hanging_rope.episode(0, markers=markers), config.history).positions.numpy()
+    track = read_track(spec, hanging_rope.episode(0, markers=markers), config.history)
+    path = track.positions.numpy()
     along = arc_lengths(spec)
     assert along is not None
     layout = lay_out(along, held_vertices(spec, path[::5].astype(float), float(np.ptp(along))), 12)
@@ -86,17 +90,23 @@ def rope(markers: int, *, coiled: bool = False) -> tuple[WorldModel, Inputs]:
     if coiled:
         natural = np.random.default_rng(7).normal(0.0, 8.0, prior.natural.shape).astype(np.float32)
         prior = dataclasses.replace(prior, natural=natural, twist=np.array([0.7], np.float32))
-    return moving(config, spec, prior), inputs(spec, config, path, 6)
+    scales = measure_modes([track.positions], spec, config.history) if modes else None
+    return moving(config, spec, prior, scales), inputs(spec, config, path, 6)
 
 
 def moving(
-    config: WorldModelConfig, spec: GraphSpec, prior: ModalPrior | ChainPrior | InertialPrior
+    config: WorldModelConfig,
+    spec: GraphSpec,
+    prior: ModalPrior | ChainPrior | InertialPrior,
+    modes: ModeScales | None,
 ) -> WorldModel:
     """An untrained network whose every term moves the body."""
     torch.manual_seed(4)
     scales = Normalisation(velocity=5e-3, change=5e-2, properties=(0.5, 0.3), **SCALES)
-    model = WorldModel(config, spec, scales, prior)
+    model = WorldModel(config, spec, scales, prior, modes=modes)
     with torch.no_grad():
+        if model.modes is not None:
+            model.modes.weight.normal_(0.0, 0.1)
         model.skip.weight.normal_(0.0, 0.05)
         model.decoder.out.weight.normal_(0.0, 0.3)
     return model
@@ -179,10 +189,17 @@ BODIES: dict[str, Callable[[], tuple[WorldModel, Inputs]]] = {
     "edges of the current shape": lambda: bar(CURRENT, None),
     "modal prior in the grip's frame": lambda: bar(held_bar.SMALL, None, framed=True),
     "no prior in the grip's frame": lambda: bar(held_bar.SMALL, None, alone=True, framed=True),
+    "no prior and a map of modes": lambda: bar(held_bar.SMALL, None, alone=True, modes=True),
+    "no prior and a map of modes over a ground": lambda: bar(held_bar.SMALL, -0.1, alone=True, modes=True),
+    "no prior and a map of modes in the grip's frame": lambda: bar(
+        held_bar.SMALL, None, alone=True, framed=True, modes=True
+    ),
     "grip's frame of points on a line": lambda: bar(held_bar.SMALL, None, framed=True, line=True),
     "no prior": lambda: bar(held_bar.SMALL, None, alone=True),
     "chain prior, grips of two markers": lambda: rope(2),
     "chain prior, grips of three markers": lambda: rope(3),
+    "chain prior and a map of modes": lambda: rope(3, modes=True),
+    "coiled chain and a map of modes": lambda: rope(2, coiled=True, modes=True),
     "coiled chain between two grips": lambda: rope(2, coiled=True),
     "coiled chain on one grip": lambda: rope(3, coiled=True),
 }
