@@ -15,7 +15,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -25,22 +24,11 @@ from physworld.worldmodel.model.features import vertex_features
 from physworld.worldmodel.model.frame import turn_of
 from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.model.model import EdgeConstants, WorldModel
+from physworld.worldmodel.model.modes import graph_modes
 from physworld.worldmodel.native.messages import as_seen
 
-MODES = 16
-KERNEL_SPACINGS = 1.5  # width of the weights of the Laplacian, in mean distances of nearest vertices
 SMALLEST_M = 1e-8
 MEASURED = 24  # episodes that sizes are measured on
-
-
-def graph_modes(rest: np.ndarray, count: int) -> np.ndarray:
-    """U (n, R) of rest places (n, 3) [m]; at most n modes."""
-    apart = np.linalg.norm(rest[:, None] - rest[None], axis=2)
-    width = KERNEL_SPACINGS * np.sort(apart, axis=1)[:, 1].mean()
-    weights = np.exp(-0.5 * np.square(apart / width))
-    np.fill_diagonal(weights, 0.0)
-    modes: np.ndarray = np.linalg.eigh(np.diag(weights.sum(axis=1)) - weights)[1]
-    return modes[:, :count] * np.sqrt(len(rest))
 
 
 class SpectralModel(WorldModel):
@@ -56,7 +44,7 @@ class SpectralModel(WorldModel):
 
     def __init__(self, config: WorldModelConfig, spec: GraphSpec, *rest: Any, tracks: list[Track]) -> None:
         super().__init__(config, spec, *rest[:3])  # without the product's own map of modes
-        modes = torch.as_tensor(graph_modes(spec.rest_vertices, MODES), dtype=torch.float32)
+        modes = torch.as_tensor(graph_modes(spec.rest_vertices).T, dtype=torch.float32)
         n, count, h, hidden = spec.object_count, modes.shape[1], config.history, config.hidden
         self.register_buffer("waves", modes)
         self.mix = nn.ParameterList(

@@ -196,6 +196,7 @@ def train(
         model = network(config, spec, scales, prior, columns, modes).to(device)
     run = _start(model, scales, training)
     identity = _identity(config, training, scales)
+    identity |= {} if model.modes is None else {"mapped_modes": len(model.modes.shapes)}
     if checkpoint is not None:
         _restore(run, checkpoint, identity)
     if run.step == 0:

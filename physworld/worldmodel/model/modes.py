@@ -123,7 +123,7 @@ def measure_modes(paths: Sequence[Tensor], spec: GraphSpec, history: int) -> Mod
         changes.append(torch.einsum("rn,tnk->trk", turned, change) / n)
     seen = torch.cat(features).double()
     parts, modes, controls = history + 2, len(shapes), spec.control_count
-    of_modes, of_held = seen.split([3 * parts * modes, 3 * parts * controls], dim=1)  # type: ignore[no-untyped-call]
+    of_modes, of_held = seen[:, : 3 * parts * modes], seen[:, 3 * parts * modes :]
     own, held = of_modes.reshape(-1, parts, modes, 3), of_held.reshape(-1, parts, controls, 3)
     middles = []
     for values in (own, held):

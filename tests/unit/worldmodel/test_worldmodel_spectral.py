@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from held_bar import SMALL, episode, graph
 
-from benchmarks.worldmodel.spectral import SpectralModel, graph_modes, spectral
+from benchmarks.worldmodel.spectral import SpectralModel, spectral
 from physworld.worldmodel.dataset import read_track
 from physworld.worldmodel.model.config import TrainingConfig
 from physworld.worldmodel.training import train
 
 pytestmark = pytest.mark.slow
-
-
-def test_modes_of_the_graph_are_orthogonal_and_the_first_is_the_whole_body() -> None:
-    rest = np.random.default_rng(1).uniform(size=(20, 3))
-    modes = graph_modes(rest, 8)
-    assert modes.T @ modes / len(rest) == pytest.approx(np.eye(8), abs=1e-9)
-    assert np.abs(modes[:, 0]) == pytest.approx(np.ones(20))
 
 
 @pytest.mark.parametrize("framed", [False, True])

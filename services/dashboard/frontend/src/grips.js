@@ -8,7 +8,7 @@ export class Grips {
     this.boxes = [];
   }
 
-  /** A new session of so many grips, of which these sets can hold; at its start all boxes are as the first set's. */
+  /** A new session of so many grips, of which these sets can hold; at its start all do. */
   offer(count, sets) {
     this.sets = sets.map((one) => one.join());
     this.box.hidden = sets.length < 2;
