@@ -1,7 +1,7 @@
 """Two versions of a model side by side: their errors on the held-out frames, and what differs in how they were made.
 
 Means carry 95 % intervals by blocks of neighbouring frames, and the gain of one version over the other is taken frame
-by frame where both were scored on the same frames of the same recording (``physworld.evaluate.blocks``).
+by frame where both were scored on the same frames of the same recording (``physworld.estimation.blocks``).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _mean(table: Mapping[str, Any], metric: str, predictor: str, curve: Array | 
         return None
     if curve is None or not np.isfinite(curve).any():
         return MeasuredError(value=value)
-    from physworld.evaluate.blocks import (
+    from physworld.estimation.blocks import (
         mean_with_interval,
     )  # scipy's statistics take half a second to import
 
@@ -96,7 +96,7 @@ def _mean(table: Mapping[str, Any], metric: str, predictor: str, curve: Array | 
 def _gain(a: Array | None, b: Array | None) -> MeasuredError | None:
     if a is None or b is None or not np.isfinite(a - b).any():
         return None
-    from physworld.evaluate.blocks import paired_gain
+    from physworld.estimation.blocks import paired_gain
 
     gain = paired_gain(a, b)
     return MeasuredError(value=gain.value, ci95=gain.ci95)

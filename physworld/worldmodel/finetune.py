@@ -10,8 +10,9 @@ where s is the root-mean-square excursion of the measured points and Chamfer goe
 to the nearest predicted ones. Strengths of effects that the model takes (``WorldModel.shared_columns``) are optimised
 with Φ, one number each for the whole body, and kept within their intervals. The states are refreshed by a new rollout
 each time the inner validation is made. That one, the open-loop error on the last share of the *training* frames,
-decides when to stop and whether the result is kept at all: a Φ that does not beat the calibrated one there is thrown
-away.
+decides when to stop and whether the result is kept at all: a Φ is thrown away unless the whole 95 % interval of its
+gain over the calibrated one is above zero there (``physworld.estimation.blocks.paired_gain``). Neighbouring frames err
+alike: a few per cent may be chance, which the frames after them take back.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import torch
 from torch import Tensor
 
 from physworld.arrays import Array
+from physworld.estimation.blocks import paired_gain
 from physworld.worldmodel.dataset import graph_origin
 from physworld.worldmodel.errors import TrainingCancelled
 from physworld.worldmodel.model.config import FineTuneConfig
@@ -58,14 +60,15 @@ class Recording:
 
 @dataclass(frozen=True)
 class FineTuneResult:
-    """``phi`` (n, 2), ``strengths`` by name of their column; the inner validation error [m] before and after; whether
-    they were kept.
+    """``phi`` (n, 2) and ``strengths`` by name of their column: what was found if it is ``kept``, else where it began;
+    the inner validation error [m] before, and the least after; the 95 % interval of the difference.
     """
 
     phi: Array
     strengths: dict[str, float]
     error_before_m: float
     error_after_m: float
+    gain_ci95_m: tuple[float, float]
     kept: bool
     steps: int
 
@@ -99,7 +102,7 @@ def fine_tune(
     limits = np.array([one.limits for one in shared], dtype=float).reshape(-1, 2)
     if not len(recording.ticks):
         still = dict.fromkeys((one.name for one in shared), 0.0)
-        return FineTuneResult(np.array(phi, dtype=float), still, np.nan, np.nan, False, 0)
+        return FineTuneResult(np.array(phi, dtype=float), still, np.nan, np.nan, (np.nan, np.nan), False, 0)
     trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
     for parameter in trainable:
         parameter.requires_grad_(False)
@@ -124,7 +127,7 @@ def _optimise(
     start = torch.cat([start, start.new_zeros(len(start), len(limits))], dim=1)
     low, high = (torch.as_tensor(side, dtype=torch.float32) / scale[local_count:] for side in limits.T)
     path = task.rollout(start)
-    before = best = task.validation_error(path)
+    before = best = task.validation_errors(path)
     best_phi, best_step, step = start, 0, 0
     local = torch.zeros_like(start[:, :local_count], requires_grad=True)
     shared = torch.zeros(len(limits), requires_grad=True)
@@ -148,15 +151,34 @@ def _optimise(
             change = torch.cat([local, shared.expand(len(start), -1)], dim=1)
             candidate = (start + change * scale).detach()
             path = task.rollout(candidate)
-            error = task.validation_error(path)
-            if error < best:
-                best, best_phi, best_step = error, candidate, step
+            errors = task.validation_errors(path)
+            if errors.mean() < best.mean():
+                best, best_phi, best_step = errors, candidate, step
             elif step - best_step >= PATIENCE_CHECKS * CHECK_EVERY:
                 break
-    found = best_phi.double().numpy()
+    interval = _gain(before, best)
+    kept = best_step > 0 and interval[0] > 0.0
+    found = (best_phi if kept else start).double().numpy()
     names = [one.name for one in model.shared_columns]
     strengths = dict(zip(names, found[0, local_count:].tolist(), strict=True))
-    return FineTuneResult(found[:, :local_count].copy(), strengths, before, best, best_step > 0, step)
+    return FineTuneResult(
+        phi=found[:, :local_count].copy(),
+        strengths=strengths,
+        error_before_m=float(before.mean()),
+        error_after_m=float(best.mean()),
+        gain_ci95_m=interval,
+        kept=kept,
+        steps=step,
+    )
+
+
+def _gain(before: Array, after: Array) -> tuple[float, float]:
+    """The 95 % interval [m] of what the errors of the same frames (F,) are smaller after; endless where the rollout
+    before left the numbers and the one after did not.
+    """
+    if not np.isfinite(before).all():
+        return (np.inf, np.inf) if np.isfinite(after).all() else (np.nan, np.nan)
+    return paired_gain(before, after).ci95
 
 
 class _Task:
@@ -207,16 +229,19 @@ class _Task:
         names = (one.name for one in self.model.shared_columns)
         return dict(zip(names, phi[0, len(PROPERTIES) :].tolist(), strict=True))
 
-    def validation_error(self, path: Tensor) -> float:
-        """Mean distance [m] of visible points in the frames that the fit does not see; infinite if not a
-        number.
+    def validation_errors(self, path: Tensor) -> Array:
+        """Mean distance [m] of visible points in each of the frames (F,) that the fit does not see and that show one;
+        infinite if not a number; a zero where no frame shows a point.
         """
         held_out = slice(self.fitting, None) if self.fitting < len(self.left) else slice(None)
-        n = self.model.spec.object_count
+        n, seen = self.model.spec.object_count, self.visible[held_out]
         predicted = self._at_frames(path[:, :n], np.arange(len(self.left))[held_out], 0)
-        distance = torch.linalg.vector_norm(predicted - self.points[held_out], dim=-1)[self.visible[held_out]]
-        error = float(distance.double().mean()) if distance.numel() else 0.0
-        return error if np.isfinite(error) else np.inf
+        distance = torch.linalg.vector_norm(predicted - self.points[held_out], dim=-1).double()
+        shown = seen.any(dim=1)
+        if not shown.any():
+            return np.zeros(1)
+        errors: Array = (torch.where(seen, distance, 0.0).sum(dim=1) / seen.sum(dim=1))[shown].numpy()
+        return np.where(np.isfinite(errors), errors, np.inf)
 
     def loss(self, path: Tensor, phi: Tensor) -> Tensor:
         """Data terms over all segments."""

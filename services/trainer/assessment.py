@@ -2,7 +2,7 @@
 
 The model is rolled out over the recording, open loop from its start. Its mean track error is compared with what noise
 alone shows and with the held-out error on the model's card, both with intervals by blocks of frames
-(:mod:`physworld.evaluate.blocks`). Scored are all frames after the model's history, or of these the recording's
+(:mod:`physworld.estimation.blocks`). Scored are all frames after the model's history, or of these the recording's
 held-out ones alone; another version of the model may be measured on the same frames. What follows from a model that has
 become worse is the database's business: the commit opens a trace (``physworld_storage.jobs.kinds.assessment``).
 """
@@ -16,8 +16,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.errors import SceneUnsupported
-from physworld.estimation.noise import held_out_frames
-from physworld.evaluate.blocks import (
+from physworld.estimation.blocks import (
     AS_EXPECTED,
     WITHIN_NOISE,
     Comparison,
@@ -26,6 +25,7 @@ from physworld.evaluate.blocks import (
     mean_with_interval,
     paired_gain,
 )
+from physworld.estimation.noise import held_out_frames
 from physworld.evaluate.metrics import noise_floor, track_error_per_frame
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.evaluate.blocks import mean_with_interval, paired_gain
+from physworld.estimation.blocks import mean_with_interval, paired_gain
 from physworld.evaluate.metrics import track_error_per_frame
 from physworld.scene import Scene
 from physworld.twin.twin import Twin

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.evaluate.blocks import mean_with_interval
+from physworld.estimation.blocks import mean_with_interval
 from physworld.evaluate.metrics import metrics
 from physworld.evaluate.table import held_out_table
 from physworld.worldmodel.clock import resample_smooth

@@ -365,6 +365,7 @@ def _metrics(
             "kept": tuned.kept,
             "inner_validation_before_m": tuned.error_before_m,
             "inner_validation_after_m": tuned.error_after_m,
+            "inner_gain_ci95_m": list(tuned.gain_ci95_m),
             "steps": tuned.steps,
             "phi_rms": float(np.sqrt((tuned.phi**2).mean())),
         },

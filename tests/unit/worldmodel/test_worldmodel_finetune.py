@@ -30,6 +30,7 @@ TRAINING = TrainingConfig(
 )
 TUNING = FineTuneConfig(steps=20, window=10, windows=3)
 WRONG_PHI = 0.5
+OFF_M = 4e-3
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +72,23 @@ def test_a_wrong_property_is_mended_by_the_recording(
     result = fine_tune(published.model, np.zeros_like(truth), recording, published.skin, TUNING)
     assert result.kept
     assert result.error_after_m < 0.8 * result.error_before_m
+    gain = result.error_before_m - result.error_after_m
+    assert 0.0 < result.gain_ci95_m[0] < gain < result.gain_ci95_m[1]
+
+
+def test_a_gain_that_may_be_chance_is_not_kept(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    """Every property is right; the points of a frame lie off together, so that some Φ fits them a little better."""
+    controllers = episodes[1]["controllers"].astype(np.float64)
+    right = np.zeros((published.spec.object_count, 2))
+    recording = _recording(published, controllers, right)
+    shift = np.random.default_rng(0).normal(scale=OFF_M, size=(len(recording.ticks), 1, 3))
+    off = dataclasses.replace(recording, points=recording.points + shift)
+    result = fine_tune(published.model, right, off, published.skin, TUNING)
+    assert result.error_after_m < result.error_before_m, "nothing was found that errs less"
+    assert result.gain_ci95_m[0] <= 0.0 and not result.kept
+    np.testing.assert_array_equal(result.phi, right)
 
 
 def test_a_property_that_is_right_stays_as_it_is(

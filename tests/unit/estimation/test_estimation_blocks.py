@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physworld.evaluate.blocks import (
+from physworld.estimation.blocks import (
     AS_EXPECTED,
     WITHIN_NOISE,
     WORSE,
