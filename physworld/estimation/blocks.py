@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import ndtri, stdtrit
 
 from physworld.arrays import Array
 
@@ -117,7 +117,7 @@ def _length(count: int) -> int:
 def _widening(count: int) -> float:
     """Factor on the deviations of resampled means of ``count`` frames."""
     blocks = max(count / _length(count), 1.5)
-    return float(t.ppf(_TAILS[1], blocks - 1) / norm.ppf(_TAILS[1]) * (blocks / (blocks - 1)) ** 0.5)
+    return float(stdtrit(blocks - 1, _TAILS[1]) / ndtri(_TAILS[1]) * (blocks / (blocks - 1)) ** 0.5)
 
 
 def _means(values: Array, seed: int) -> Array:
