@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.estimation.blocks import mean_with_interval, paired_gain
 from physworld_schemas.library import catalogue
 from physworld_schemas.model import (
     ComparedError,
@@ -87,12 +86,16 @@ def _mean(table: Mapping[str, Any], metric: str, predictor: str, curve: Array | 
         return None
     if curve is None or not np.isfinite(curve).any():
         return MeasuredError(value=value)
+    from physworld.estimation.blocks import mean_with_interval  # needs scipy, which the web process loads late
+
     return MeasuredError(value=value, ci95=mean_with_interval(curve).ci95)
 
 
 def _gain(a: Array | None, b: Array | None) -> MeasuredError | None:
     if a is None or b is None or not np.isfinite(a - b).any():
         return None
+    from physworld.estimation.blocks import paired_gain
+
     gain = paired_gain(a, b)
     return MeasuredError(value=gain.value, ci95=gain.ci95)
 
