@@ -86,7 +86,8 @@ def _mean(table: Mapping[str, Any], metric: str, predictor: str, curve: Array | 
         return None
     if curve is None or not np.isfinite(curve).any():
         return MeasuredError(value=value)
-    from physworld.estimation.blocks import mean_with_interval  # needs scipy, which the web process loads late
+    # scipy, which the web process loads when it is asked for
+    from physworld.estimation.blocks import mean_with_interval
 
     return MeasuredError(value=value, ci95=mean_with_interval(curve).ci95)
 
