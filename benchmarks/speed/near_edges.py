@@ -24,7 +24,8 @@ from physworld.demonstrate import DemonstrationConfig
 from physworld.worldmodel.dataset import read_track
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.graph import GraphSpec, build_graph
-from physworld.worldmodel.training import open_loop_error, train
+from physworld.worldmodel.training import train
+from physworld.worldmodel.training_run import open_loop_error
 
 BEAM, HAIRPIN = "soft_beam", "hairpin"
 EPISODES, UNSEEN, SEEDS = {BEAM: 32, HAIRPIN: 24}, 12, 2

@@ -266,6 +266,7 @@ def _train(
         """The priors are fitted once the network is validated for the first time, or trains on from a checkpoint."""
         if not latest:
             context.begin(of_grips(TRAINING, grips), "steps", training.steps)
+            episodes.reached = (0, training.steps)
 
     def progress(step: int, steps: int, loss: float) -> None:
         begin_training()
@@ -276,7 +277,7 @@ def _train(
     def validated(step: int, error_m: float) -> None:
         begin_training()
         latest["validation_m"] = error_m
-        context.progress(step, training.steps, "steps", f"validation {1e3 * error_m:.3g} mm", latest)
+        context.progress(*episodes.reached, "steps", f"validation {1e3 * error_m:.3g} mm", latest)
 
     def attempt(checkpoint: bytes | None) -> TrainingResult:
         return train(
@@ -354,6 +355,7 @@ def _metrics(
             "prior": trained.prior,
             "prior_m": trained.prior_error_m,
             "priors_m": trained.prior_errors_m,
+            "heats_m": trained.heats_m,
             "best_step": trained.best_step,
             "steps": trained.steps,
             "steps_left_out": trained.steps_left_out,

@@ -84,6 +84,15 @@ def choose(errors: dict[str, float]) -> str:
     return best
 
 
+def contenders(errors: dict[str, float]) -> list[str]:
+    """The priors whose networks compete: the chain and the modal one that errs less alone, where both keep to numbers;
+    else the one that :func:`choose` takes."""
+    modal = {name: error for name, error in errors.items() if name != CHAIN and np.isfinite(error)}
+    if modal and np.isfinite(errors.get(CHAIN, np.inf)):
+        return [CHAIN, choose(modal)]
+    return [choose(errors)]
+
+
 def prior_error(prior: Prior, tracks: list[Track], spec: GraphSpec, history: int) -> float:
     """Mean distance [m] of object vertices over whole episodes, predicted by the prior alone, in the graph's frame.
 

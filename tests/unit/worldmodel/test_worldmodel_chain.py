@@ -277,6 +277,7 @@ def test_training_takes_the_prior_that_errs_less_and_says_so() -> None:
     result = train([*learn, *judge], graph(3), SMALL, TrainingConfig(steps=1, batch_size=1, look_ahead=2))
     assert result.prior == "chain" and set(result.prior_errors_m) == {"chain", "modal"}
     assert result.prior_error_m == pytest.approx(result.prior_errors_m["chain"], rel=1e-3)
+    assert result.heats_m == {}
     plain = train(learn, graph(3), SMALL, TrainingConfig(steps=1, batch_size=1, look_ahead=2, prior="modal"))
     assert plain.prior == "modal" and set(plain.prior_errors_m) == {"modal"}
 

@@ -29,7 +29,8 @@ from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.skinning import affine_skin
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.rollout import rollout
-from physworld.worldmodel.training import open_loop_error, train
+from physworld.worldmodel.training import train
+from physworld.worldmodel.training_run import open_loop_error
 
 LEARNED, JUDGED, H = 18, 4, SMALL.history
 PRIOR_ALONE = TrainingConfig(steps=1, batch_size=1, look_ahead=2, prior="modal")

@@ -17,7 +17,8 @@ from physworld.worldmodel.model.inertia import InertialPrior, InertialStep
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.rollout import unroll
-from physworld.worldmodel.training import TrainingResult, open_loop_error, train
+from physworld.worldmodel.training import TrainingResult, train
+from physworld.worldmodel.training_run import open_loop_error
 
 pytestmark = pytest.mark.slow
 

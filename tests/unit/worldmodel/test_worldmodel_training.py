@@ -9,7 +9,7 @@ import pytest
 import torch
 from held_bar import SMALL, graph
 
-from physworld.worldmodel import training as training_module
+from physworld.worldmodel import training_run
 from physworld.worldmodel.dataset import Track, WindowSampler, read_track, split_tracks
 from physworld.worldmodel.errors import (
     CheckpointMismatch,
@@ -156,9 +156,7 @@ def test_a_training_that_diverges_late_returns_the_best_network_before(
     assert 0 < found.best_step <= 30
     assert found.best_error_m == min(error for _, error in found.validation) < found.prior_error_m
     _, held_out = split_tracks(tracks, settings.validation_fraction, settings.seed)
-    assert training_module.open_loop_error(found.model, held_out) == pytest.approx(
-        found.best_error_m, rel=1e-6
-    )
+    assert training_run.open_loop_error(found.model, held_out) == pytest.approx(found.best_error_m, rel=1e-6)
 
 
 def test_a_step_whose_gradient_explodes_is_left_out(
@@ -184,14 +182,12 @@ def test_a_step_whose_gradient_explodes_is_left_out(
 
 
 def test_only_what_is_far_from_usual_explodes() -> None:
-    run = training_module._Run(*[None] * 6)  # type: ignore[arg-type]
-    used = [training_module._usable(run, 0.5, norm) for norm in (2.0, 3.0, 40.0, 1e9, float("inf"), 5.0)]
+    run = training_run.Run(*[None] * 8)  # type: ignore[arg-type]
+    used = [training_run.usable(run, 0.5, norm) for norm in (2.0, 3.0, 40.0, 1e9, float("inf"), 5.0)]
     assert used == [True, True, True, False, False, True]
     assert (run.left_out, run.in_a_row) == (2, 0)
-    for _ in range(
-        training_module.MOST_LEFT_OUT - 1
-    ):  # a training that has become another one is not given up
-        if training_module._usable(run, 0.5, 2000.0):
+    for _ in range(training_run.MOST_LEFT_OUT - 1):  # a training that has become another one is not given up
+        if training_run.usable(run, 0.5, 2000.0):
             break
     else:
         pytest.fail("a gradient that stays larger was never used")
