@@ -58,12 +58,12 @@ class TrainingConfig(Request):
     )
     vertices: int = Field(default=100, ge=4, le=1000, description="Vertices of the graph.", examples=[100])
     steps: int = Field(
-        default=600,
+        default=1200,
         ge=1,
         le=1_000_000,
         description="Most training steps.",
         json_schema_extra={"unit": "steps"},
-        examples=[600],
+        examples=[1200],
     )
     batch_size: int = Field(default=6, ge=1, le=256, description="Rollouts of a training step.", examples=[6])
     learning_rate: float = Field(

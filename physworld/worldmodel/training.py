@@ -131,7 +131,7 @@ def train(
         total: how many episodes there will be; by default those of ``tracks``.
         later: gives an episode by its index, when it is there; raises TrainingCancelled while it waits.
         checkpoint: bytes that an earlier, interrupted run gave to ``save_checkpoint``.
-        save_checkpoint: called once it is decided which network goes on, and every ``checkpoint_every`` steps after that.
+        save_checkpoint: called once it is decided which network goes on, then every ``checkpoint_every`` steps.
         progress: called after each step with (steps done, steps in all, loss), those of a network that is given up too.
         validated: called after each validation with (step, open-loop error [m]).
         cancelled: asked before each step; true raises TrainingCancelled.

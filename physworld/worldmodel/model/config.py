@@ -78,7 +78,7 @@ class TrainingConfig:
         seed: of initial weights, batches and noise.
     """
 
-    steps: int = 600
+    steps: int = 1200
     batch_size: int = 6
     look_ahead: int = 24
     learning_rate: float = 1e-3
