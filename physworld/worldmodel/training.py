@@ -253,8 +253,9 @@ class _Feed:
 
 @dataclass
 class _Loop:
-    """What every network's training shares; the callbacks are those of :func:`train`. ``lost``: steps of networks that
-    are given up, ``before`` the one that trains and in all.
+    """What every network's training shares; the callbacks are those of :func:`train`.
+
+    ``before``: steps that other networks took until the present one began; ``lost``: steps of those given up, in all.
     """
 
     training: TrainingConfig

@@ -72,6 +72,24 @@ def test_networks_on_both_priors_compete_and_what_the_priors_err_alone_does_not_
             assert torch.equal(ours, theirs)
 
 
+def test_both_networks_see_the_same_episodes_arrive(tracks: list[Track]) -> None:
+    settings = replace(COMPETING, steps=96, validation_every=96, checkpoint_every=48, start_share=0.5)
+    asked: list[int] = []
+    saved: list[bytes] = []
+
+    def later(index: int) -> Track:
+        asked.append(index)
+        return tracks[index]
+
+    whole = train(tracks[:6], graph(3), SMALL, settings, total=12, later=later, save_checkpoint=saved.append)
+    assert set(whole.heats_m) == {"chain", "modal"} and whole.episodes == 12
+    assert asked == [*range(6, 12)]  # each once, though both networks were trained on the first of them
+    alone = train(tracks[:6], graph(3), SMALL, replace(settings, prior=whole.prior), total=12, later=later)
+    assert alone.validation[-1] == whole.validation[-1]  # the contest changes nothing of the one that goes on
+    resumed = train(tracks[:6], graph(3), SMALL, settings, total=12, later=later, checkpoint=saved[0])
+    assert resumed.validation == whole.validation and resumed.prior == whole.prior
+
+
 def test_a_network_that_diverges_in_its_heat_is_given_up(
     tracks: list[Track], monkeypatch: pytest.MonkeyPatch
 ) -> None:
