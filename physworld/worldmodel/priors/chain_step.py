@@ -10,7 +10,6 @@ Legend: B batch, M = 2 B: every sequence with its speed and with the opposite on
 from __future__ import annotations
 
 from dataclasses import fields
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -84,13 +83,15 @@ class ChainStep(nn.Module):
 
     def forward(self, window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
         """x̂^{t+1} (n, B, 3) from x^{t-h} … x^t (h+1, V, B, 3), c^{t+1} (C, B, 3) and Φ (n, B, 2)."""
-        n, batch = self.spread.shape[0], window.shape[2]
-        ahead, here, behind = (self.driven(c) for c in (control_next, window[-1, n:], window[-2, n:]))
-        now, before = self._nodes(window[-1, :n], here), self._nodes(window[-2, :n], behind)
+        n, batch, known = self.spread.shape[0], window.shape[2], min(self.history, 2) + 1
+        latest = window[-known:].flip(0).transpose(0, 1).flatten(1, 2)  # (V, known B, 3), newest first
+        led = self.driven(torch.cat([latest[n:], control_next], dim=1))  # of all frames at once
+        places = self._nodes(latest[:n], led[:, : known * batch])
+        here, behind, ahead = led[:, :batch], led[:, batch : 2 * batch], led[:, known * batch :]
+        now, before = places[:, :batch], places[:, batch : 2 * batch]
         speed = now - before
-        if self.history > 1:
-            older = self._nodes(window[-3, :n], self.driven(window[-3, n:]))
-            speed = 1.5 * speed - 0.5 * (before - older)
+        if known > 2:
+            speed = 1.5 * speed - 0.5 * (before - places[:, 2 * batch :])
         speed = self._free * self._rigid(now, _times(self.smooth, speed))
         slope, turn = 0.5 * (ahead - behind), ahead - 2.0 * here + behind
         pull, bend, ease = self._moduli(phi)
@@ -261,12 +262,18 @@ class ChainStep(nn.Module):
 
 def _carried(along: Tensor, start: Tensor) -> Tensor:
     """``start`` (B, 3) across the first of some segments, carried by least rotations along all (S, B, 3)."""
-    carried = [start]
-    for one, following in pairwise(along):
-        axis, lean = torch.linalg.cross(one, following), 1.0 + (one * following).sum(dim=-1, keepdim=True)
-        once = torch.linalg.cross(axis, carried[-1])
-        carried.append(carried[-1] + once + torch.linalg.cross(axis, once) / lean.clamp(min=LEAN_FLOOR))
-    return torch.stack(carried)
+    one, following = along[:-1], along[1:]
+    axis, lean = torch.linalg.cross(one, following), 1.0 + (one * following).sum(dim=-1, keepdim=True)
+    x, y, z = axis.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    across = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    turn = torch.eye(3, dtype=along.dtype, device=along.device) + across
+    turn = turn + across @ across / lean.clamp(min=LEAN_FLOOR)[..., None]
+    span = 1
+    while span < len(turn):  # products of all turns up to each, by doubling: a few large operations
+        turn = torch.cat([turn[:span], turn[span:] @ turn[:-span]])
+        span *= 2
+    return torch.cat([start[None], (turn @ start[..., None])[..., 0]])
 
 
 def _across(vector: Tensor, along: Tensor) -> Tensor:
