@@ -21,7 +21,8 @@ class TrainingConfig(Request):
     The defaults are meant for some minutes on one core. ``patience``: validations without a better one after which
     the training ends (0: never). ``start_share`` below 1: the training may begin once that share of the dataset's
     episodes is committed, and takes the others in as it goes (``physworld.worldmodel.training``). ``prior``: what the
-    network corrects; ``none``: it stands alone. ``frame``: the axes of a step, ``world``, ``grip`` (the grip's frame,
+    network corrects; ``auto``: of a rope the prior whose network errs less after an eighth of the steps; ``none``: it
+    stands alone. ``frame``: the axes of a step, ``world``, ``grip`` (the grip's frame,
     where the scene has one) or ``auto``: what errs less on episodes that are not learned from. ``near_edges``:
     ``current`` finds the neighbours anew at every step, so that parts of the object that meet see each other.
     ``start_from``: a version, perhaps of another object, from whose network the training goes on.

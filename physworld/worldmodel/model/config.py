@@ -68,8 +68,9 @@ class TrainingConfig:
         validation_fraction: share of the episodes held out whole.
         validation_every: steps between open-loop validations.
         patience: validations in a row without a better one after which the training ends early; 0: never.
-        prior: what stands under the network: "modal", "chain", "auto": whichever of the two errs less on validation
-            episodes, or "none": the network alone gives the accelerations (``physworld.worldmodel.model.inertia``).
+        prior: what stands under the network: "modal", "chain", "auto": of the two the one whose network errs less on
+            validation episodes after the first steps, or "none": the network alone gives the accelerations
+            (``physworld.worldmodel.model.inertia``).
         frame: in which axes a step is taken: "world"; "grip": in the grip's frame where the scene has one
             (``physworld.worldmodel.model.frame``); "auto": what errs less on validation episodes.
         start_share: share of the episodes that the training begins with; 1: it has all of them from the start.

@@ -1,9 +1,10 @@
 """Which prior stands under the network: the modal one, or the chain where the body is a rope.
 
 Every prior that can be made of the episodes is rolled out alone over whole held-out ones, the modal one in world axes
-and in the grip's frame; the training takes the one that errs least, and the card says what each erred
-(``validation.priors_m``). The frame is for turns of the grips that validation episodes may not show: the modal prior in
-it is taken unless the one in world axes is clearly better.
+and in the grip's frame (``validation.priors_m`` of the card). Of the modal ones that which errs less is taken; a chain
+and a modal one both go on as :func:`contenders`, until their networks show which is better. The frame is for turns of
+the grips that validation episodes may not show: the modal prior in it is taken unless the one in world axes is clearly
+better.
 """
 
 from __future__ import annotations
