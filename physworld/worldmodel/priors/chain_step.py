@@ -266,7 +266,7 @@ def _carried(along: Tensor, start: Tensor) -> Tensor:
     axis, lean = torch.linalg.cross(one, following), 1.0 + (one * following).sum(dim=-1, keepdim=True)
     x, y, z = axis.unbind(dim=-1)
     zero = torch.zeros_like(x)
-    across = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    across = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*x.shape, 3, 3)
     turn = torch.eye(3, dtype=along.dtype, device=along.device) + across
     turn = turn + across @ across / lean.clamp(min=LEAN_FLOOR)[..., None]
     span = 1
