@@ -57,7 +57,7 @@ def main() -> int:
     parser.add_argument("--bodies", nargs="*", default=[*BODIES], choices=[*BODIES])
     parser.add_argument("--taught", type=int, default=TAUGHT, help="episodes to learn from")
     parser.add_argument("--frames", type=int, default=TAUGHT_FRAMES, help="of each of them")
-    parser.add_argument("--steps", type=int, default=1200, help="of each training")
+    parser.add_argument("--steps", type=int, default=600, help="of each training")
     given = parser.parse_args()
     torch.set_num_threads(1)
     known = json.loads(given.json.read_text())["bodies"] if given.json.exists() else []

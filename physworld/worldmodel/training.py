@@ -47,13 +47,7 @@ from physworld.worldmodel.model.inertia import one_step_residual
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.modes import measure_modes
 from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
-from physworld.worldmodel.priors.choose import (
-    choose,
-    contenders,
-    fit_priors,
-    prior_error,
-    spec_for,
-)
+from physworld.worldmodel.priors.choose import choose, contenders, fit_priors, prior_error, spec_for
 from physworld.worldmodel.priors.modal import ModalPrior
 from physworld.worldmodel.priors.prior_step import framed_prior, prior_step
 from physworld.worldmodel.rollout import mean_error
@@ -69,7 +63,7 @@ from physworld.worldmodel.training_run import (
     validate,
 )
 
-HEAT_SHARE = 0.125
+HEAT_SHARE = 0.125  # of the steps
 JOIN_SHARE = 0.5
 JOIN_BATCHES = 10
 

@@ -182,7 +182,7 @@ def test_a_step_whose_gradient_explodes_is_left_out(
 
 
 def test_only_what_is_far_from_usual_explodes() -> None:
-    run = training_run.Run(*[None] * 8)  # type: ignore[arg-type]
+    run = training_run.begin(WorldModel(SMALL, graph()), Normalisation(), "none", SHORT)
     used = [training_run.usable(run, 0.5, norm) for norm in (2.0, 3.0, 40.0, 1e9, float("inf"), 5.0)]
     assert used == [True, True, True, False, False, True]
     assert (run.left_out, run.in_a_row) == (2, 0)
